@@ -1,0 +1,103 @@
+"""What turns clips into depth, as the service and the command see it.
+
+An engine is found through an entry point of the group ``bathyscope.engines``, so whoever calls it imports none of the
+packages that implement it. A call of :meth:`Engine.run` gives a :class:`DepthRun`: finished frames, one by one, in
+video order, and after the last of them what they mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Literal, Protocol, cast
+
+from pydantic import BaseModel, PositiveInt
+
+from bathyscope.bundle import Bundle
+from bathyscope.errors import SettingsError
+from bathyscope.result import FrameDepth, ResultMeta
+
+ENGINE_GROUP = "bathyscope.engines"
+
+
+class DepthOptions(BaseModel, frozen=True, extra="forbid"):
+    """What may be asked for with each clip."""
+
+    stride: PositiveInt = 1
+    """Use every n-th frame of the source."""
+    depth: Literal["rendered", "head"] = "rendered"
+    """Depth rendered from the scene of Gaussians, or the depth head's own."""
+    dtype: Literal["float32", "float16"] = "float32"
+    """Type of the depth and confidence maps."""
+    max_frames: PositiveInt | None = None
+    """Stop after this many frames of the result."""
+
+
+class DepthRun(Protocol):
+    """One clip on its way through an engine; iterate over it once."""
+
+    def __iter__(self) -> Iterator[FrameDepth]:
+        """Finished frames in video order; memory does not grow with their number.
+
+        Raises:
+            ClipError: If the source cannot be used. A source that breaks off later ends the iteration instead, and
+                ``meta()`` says so.
+        """
+        ...
+
+    def meta(self) -> ResultMeta:
+        """What the frames mean: known after the last one."""
+        ...
+
+    def close(self) -> None:
+        """Stop the work and release what it holds; safe to call twice."""
+        ...
+
+
+class Engine(Protocol):
+    """A loaded model."""
+
+    @property
+    def bundle(self) -> Bundle:
+        """The model in use."""
+        ...
+
+    def warm_up(self) -> None:
+        """Run once on a made-up clip, so that the first real one is not slow."""
+        ...
+
+    def run(self, source: Path, options: DepthOptions = ..., *, name: str | None = None) -> DepthRun:
+        """Begin with a video file, a zip of images, or a folder of images; what it is follows from its content.
+
+        Args:
+            source: File or folder.
+            options: What is asked for.
+            name: What messages and ``ResultMeta.name`` call the clip; the file's stem unless given.
+        """
+        ...
+
+
+class EngineFactory(Protocol):
+    """What an entry point of the group ``bathyscope.engines`` names."""
+
+    def __call__(self, bundle: Bundle, /) -> Engine:
+        """Load a bundle with the engine's default settings."""
+        ...
+
+
+def engine_factory(name: str = "onnx") -> EngineFactory:
+    """The installed engine of this name.
+
+    Raises:
+        SettingsError: If none is installed, or it cannot be imported; names the extra to install.
+    """
+    found = entry_points(group=ENGINE_GROUP, name=name)
+    if not found:
+        raise SettingsError(f"no engine {name!r} is installed; install it with: pip install 'bathyscope[serve]'")
+    try:
+        return cast(EngineFactory, next(iter(found)).load())
+    except ImportError as error:
+        raise SettingsError(
+            f"engine {name!r} cannot be imported ({error}); install it with: pip install 'bathyscope[serve]'"
+        ) from error
