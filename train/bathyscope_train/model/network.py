@@ -1,0 +1,162 @@
+"""The whole network: encode a clip, predict dense maps frame by frame, predict cameras.
+
+The three stages are methods of their own because a bundle runs them apart: the transformer once a clip,
+the dense heads in chunks of frames, the cameras last. :meth:`Network.forward` puts them together.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from bathyscope.errors import GeometryError
+from bathyscope_train.model.aggregator import Aggregator
+from bathyscope_train.model.camera_head import CameraHead
+from bathyscope_train.model.dense_head import DepthHead, activate_depth
+from bathyscope_train.model.gaussian_head import GaussianHead
+from bathyscope_train.model.presets import NetworkPreset
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """What the heads read of a clip."""
+
+    taps: tuple[Float[Tensor, "b t n c"], ...]
+    """Patch tokens of the tapped layers, shallow to deep."""
+    camera: Float[Tensor, "b t c"]
+    """Camera token of the last layer."""
+    stem_maps: tuple[Float[Tensor, "b t c h w"], ...] = ()
+    """Maps of the image stem, where the preset's stem keeps some."""
+
+
+@dataclass(frozen=True, slots=True)
+class DenseMaps:
+    """Per-pixel predictions of every frame."""
+
+    depth: Float[Tensor, "b t h w"]
+    """Z-depth, relative, positive."""
+    confidence: Float[Tensor, "b t h w"]
+    """Confidence of the depth, above 1."""
+    gaussians: Float[Tensor, "b t g h w"] | None
+    """Raw Gaussian parameters (see :mod:`~bathyscope_train.model.gaussian_parameters`); None without that head."""
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """Everything the network says about a clip."""
+
+    pose_encodings: Float[Tensor, "i b t 9"]
+    """Pose encodings after each iteration of the camera head (see :mod:`~bathyscope_train.model.pose_encoding`)."""
+    maps: DenseMaps
+
+    @property
+    def pose_encoding(self) -> Float[Tensor, "b t 9"]:
+        """The final pose encoding."""
+        return self.pose_encodings[-1]
+
+
+class Network(nn.Module):
+    """Cameras, depth and Gaussians for the frames of a clip, in one pass.
+
+    Parameters are named as in the published checkpoints (without their ``encoder.`` prefix).
+    """
+
+    def __init__(self, preset: NetworkPreset) -> None:
+        super().__init__()
+        self.preset = preset
+        self.aggregator = Aggregator(preset)
+        self.camera_head = build_camera_head(preset)
+        self.depth_head = build_depth_head(preset)
+        self.gaussian_param_head = build_gaussian_head(preset)
+
+    def encode(self, images: Float[Tensor, "b t 3 h w"]) -> Features:
+        """Run the transformer over clips of images in [0, 1].
+
+        Raises:
+            GeometryError: If a side of the images is not a multiple of the patch size.
+        """
+        height, width = images.shape[-2:]
+        patch = self.preset.patch_size
+        if height % patch or width % patch:
+            raise GeometryError(f"images of {height}x{width} do not divide into patches of {patch}; resize them first")
+        layers, stem_maps = self.aggregator(images)
+        special = self.aggregator.special
+        return Features(
+            taps=tuple(layers[index][:, :, special:] for index in self.preset.aggregator.taps),
+            camera=layers[self.preset.aggregator.depth - 1][:, :, 0],
+            stem_maps=stem_maps,
+        )
+
+    def dense(self, features: Features, images: Float[Tensor, "b t 3 h w"]) -> DenseMaps:
+        """Depth, confidence and raw Gaussians of every frame; frames do not see each other here."""
+        b, t = images.shape[:2]
+        frames = images.flatten(0, 1)
+        with _float32(images.device):
+            taps = [tokens.flatten(0, 1).float() for tokens in features.taps]
+            depth, confidence = activate_depth(self.depth_head(taps, frames))
+            raw = None if self.gaussian_param_head is None else self.gaussian_param_head(taps, frames)
+        return DenseMaps(
+            depth=depth.unflatten(0, (b, t)),
+            confidence=confidence.unflatten(0, (b, t)),
+            gaussians=None if raw is None else raw.unflatten(0, (b, t)),
+        )
+
+    def cameras(self, features: Features, depth: Float[Tensor, "b t h w"]) -> Float[Tensor, "b t 9"]:
+        """Final pose encoding of every frame."""
+        return self.camera_iterations(features, depth)[-1]
+
+    def camera_iterations(self, features: Features, depth: Float[Tensor, "b t h w"]) -> Float[Tensor, "i b t 9"]:
+        """Pose encodings after each iteration; the iterative head makes no use of ``depth``."""
+        del depth
+        with _float32(features.camera.device):
+            encodings: Tensor = self.camera_head(features.camera.float())
+        return encodings
+
+    def forward(self, images: Float[Tensor, "b t 3 h w"]) -> Prediction:
+        """Predict everything for clips of images in [0, 1]; sides are multiples of the patch size."""
+        features = self.encode(images)
+        maps = self.dense(features, images)
+        return Prediction(pose_encodings=self.camera_iterations(features, maps.depth), maps=maps)
+
+
+def build_camera_head(preset: NetworkPreset) -> nn.Module:
+    """The camera head that ``preset.camera`` asks for."""
+    settings = preset.camera
+    return CameraHead(
+        width=2 * preset.aggregator.width,
+        depth=settings.depth,
+        heads=settings.heads,
+        iterations=settings.iterations,
+        mlp_ratio=preset.aggregator.mlp_ratio,
+        layer_scale=settings.layer_scale,
+    )
+
+
+def build_depth_head(preset: NetworkPreset) -> nn.Module:
+    """The depth head that ``preset.depth`` asks for."""
+    return DepthHead(2 * preset.aggregator.width, preset.depth, patch_size=preset.patch_size)
+
+
+def build_gaussian_head(preset: NetworkPreset) -> nn.Module | None:
+    """The Gaussian head that ``preset.gaussians`` asks for, if any; it ends in a fusion confidence channel."""
+    if preset.gaussians is None:
+        return None
+    return GaussianHead(
+        2 * preset.aggregator.width,
+        preset.gaussians,
+        outputs=preset.gaussian_channels + 1,
+        patch_size=preset.patch_size,
+    )
+
+
+@contextmanager
+def _float32(device: torch.device) -> Iterator[None]:
+    """Heads stay in float32 when the caller runs the transformer under autocast."""
+    if torch.is_autocast_enabled(device.type):
+        with torch.autocast(device.type, enabled=False):
+            yield
+    else:
+        yield
