@@ -28,8 +28,6 @@ class DepthOptions(BaseModel, frozen=True, extra="forbid"):
     """Use every n-th frame of the source."""
     depth: Literal["rendered", "head"] = "rendered"
     """Depth rendered from the scene of Gaussians, or the depth head's own."""
-    dtype: Literal["float32", "float16"] = "float32"
-    """Type of the depth and confidence maps."""
     max_frames: PositiveInt | None = None
     """Stop after this many frames of the result."""
 
