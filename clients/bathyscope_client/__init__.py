@@ -1,0 +1,1 @@
+"""Python client, batch command and output files."""

@@ -1,0 +1,158 @@
+"""The result: depth, cameras and what they mean, for every frame of a video.
+
+The same object comes from the service, the client, the command and the library. Its files are in
+:mod:`bathyscope.result_files`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field
+
+from bathyscope.camera import F64, Size
+from bathyscope.errors import GeometryError
+
+RESULT_FORMAT = 1
+"""Version of the result files; a reader refuses newer ones."""
+
+
+class BundleId(BaseModel, frozen=True, extra="forbid"):
+    """Which model made a result."""
+
+    name: str
+    version: str
+    digest: str = Field(description="SHA-256 over the bundle's manifest, which names the hash of every file.")
+
+
+class ResultMeta(BaseModel, frozen=True, extra="forbid"):
+    """What the numbers of a result mean and where they come from."""
+
+    format: int = RESULT_FORMAT
+    name: str = "clip"
+    scale: Literal["relative", "mm"] = Field(
+        default="relative", description="'relative': right up to one positive factor for each segment of the video."
+    )
+    depth: Literal["rendered", "head"] = Field(
+        default="rendered", description="Depth rendered from the scene of Gaussians, or the depth head's own."
+    )
+    bundle: BundleId | None = None
+    software: str = ""
+    complete: bool = Field(default=True, description="False: the source ended early or was damaged; see warnings.")
+    warnings: tuple[str, ...] = ()
+    settings: dict[str, Any] = Field(default_factory=dict)
+    timings_s: dict[str, float] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class FrameDepth:
+    """One finished frame, at source size (h, w)."""
+
+    index: int
+    """Number of the frame in the source, from 0."""
+    timestamp_s: float
+    depth: NDArray[np.floating]
+    """(h, w) z-depth; 0 where nothing is known."""
+    confidence: NDArray[np.floating]
+    """(h, w), larger is surer; 0 outside the field of view."""
+    valid: NDArray[np.bool_]
+    """(h, w) inside the field of view, with depth."""
+    world_from_camera: F64
+    """(4, 4) in the world of the segment's first frame."""
+    intrinsics: F64
+    """(3, 3) pixels at source size."""
+    segment: int = 0
+    """Frames of one segment share one world and one scale."""
+
+
+@dataclass(frozen=True, slots=True)
+class ClipDepth:
+    """Depth and cameras of a whole clip; t frames of (h, w) at source size.
+
+    Raises:
+        GeometryError: If the arrays do not belong together.
+    """
+
+    depth: NDArray[np.floating]
+    """(t, h, w) z-depth, float32 or float16; 0 where nothing is known."""
+    confidence: NDArray[np.floating]
+    """(t, h, w)"""
+    valid: NDArray[np.bool_]
+    """(t, h, w)"""
+    world_from_camera: F64
+    """(t, 4, 4); the first frame of each segment is the identity."""
+    intrinsics: F64
+    """(t, 3, 3) pixels at source size."""
+    timestamps_s: F64
+    """(t,) seconds from the start of the source."""
+    segment: NDArray[np.int32]
+    """(t,) frames of one segment share one world and one scale."""
+    meta: ResultMeta
+
+    def __post_init__(self) -> None:
+        if self.depth.ndim != 3:
+            raise GeometryError(f"depth must be (t, h, w), got shape {self.depth.shape}")
+        t, h, w = self.depth.shape
+        wanted = {
+            "confidence": (t, h, w),
+            "valid": (t, h, w),
+            "world_from_camera": (t, 4, 4),
+            "intrinsics": (t, 3, 3),
+            "timestamps_s": (t,),
+            "segment": (t,),
+        }
+        for name, shape in wanted.items():
+            found = getattr(self, name).shape
+            if found != shape:
+                raise GeometryError(f"{name} beside depth {self.depth.shape} must have shape {shape}, got {found}")
+
+    def __len__(self) -> int:
+        return len(self.depth)
+
+    @property
+    def size(self) -> Size:
+        """(height, width) of the source."""
+        return self.depth.shape[1], self.depth.shape[2]
+
+    def frame(self, t: int) -> FrameDepth:
+        """One frame of the clip, as a view."""
+        return FrameDepth(
+            index=t,
+            timestamp_s=float(self.timestamps_s[t]),
+            depth=self.depth[t],
+            confidence=self.confidence[t],
+            valid=self.valid[t],
+            world_from_camera=self.world_from_camera[t],
+            intrinsics=self.intrinsics[t],
+            segment=int(self.segment[t]),
+        )
+
+    @classmethod
+    def from_frames(cls, frames: list[FrameDepth], meta: ResultMeta) -> ClipDepth:
+        """The clip that finished frames make.
+
+        Raises:
+            GeometryError: If there is no frame, or their sizes differ.
+        """
+        if not frames:
+            raise GeometryError("a result needs at least one frame, got none")
+        sizes = {frame.depth.shape for frame in frames}
+        if len(sizes) > 1:
+            raise GeometryError(f"the frames of a result must have one size, got {sorted(sizes)}")
+        return cls(
+            depth=np.stack([frame.depth for frame in frames]),
+            confidence=np.stack([frame.confidence for frame in frames]),
+            valid=np.stack([frame.valid for frame in frames]),
+            world_from_camera=np.stack([frame.world_from_camera for frame in frames]),
+            intrinsics=np.stack([frame.intrinsics for frame in frames]),
+            timestamps_s=np.array([frame.timestamp_s for frame in frames], np.float64),
+            segment=np.array([frame.segment for frame in frames], np.int32),
+            meta=meta,
+        )
+
+
+ARRAY_NAMES = tuple(field.name for field in fields(ClipDepth) if field.name != "meta")
+"""Names of the arrays of a result, in the order of its files."""

@@ -1,0 +1,1 @@
+"""Serving: decode, engine and HTTP service; never imports torch."""

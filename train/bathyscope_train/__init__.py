@@ -1,0 +1,1 @@
+"""Training: network, renderers, losses, data, evaluation and the trainer."""
