@@ -1,0 +1,147 @@
+"""What a rendered domain may look like: ranges as data, read from a file or named in ``domains``."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal, Self, TypeVar
+
+import numpy as np
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
+
+from bathyscope.errors import SettingsError
+
+Family = Literal["lumen", "cavity", "sinus", "box"]
+Name = TypeVar("Name", bound=str)
+Motion = Literal["forward", "sideways", "turning", "still"]
+
+
+def _ordered(bounds: tuple[float, float]) -> tuple[float, float]:
+    if not bounds[0] <= bounds[1]:
+        raise ValueError(f"a range runs from low to high, got {bounds}")
+    return bounds
+
+
+Range = Annotated[tuple[float, float], AfterValidator(_ordered)]
+"""A uniform range, both ends included."""
+
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+
+
+class _Ranges(BaseModel, frozen=True, extra="forbid"):
+    """Strict and frozen, so that a domain can be written down beside what it rendered."""
+
+
+class LightRanges(_Ranges):
+    """The light at the tip of the endoscope."""
+
+    falloff: Range = (1.9, 2.1)
+    """Exponent p of E ~ distance^-p; 2 is a point source."""
+    spot: Range = (0.0, 0.6)
+    """Exponent of the cosine between beam axis and ray; 0 shines equally everywhere."""
+    offset_mm: Range = (1.5, 2.5)
+    """Distance of the light guides from the lens."""
+    second_light: Share = 0.4
+    """Share of clips with a second light guide opposite to the first."""
+    ambient: Range = (0.0, 0.012)
+    """Light that bounced before it reached the surface, against the direct light at 20 mm."""
+
+
+class MaterialRanges(_Ranges):
+    """Wet tissue. Colours are linear reflectances, built so that red >= green >= blue."""
+
+    red: Range = (0.72, 0.92)
+    green_over_red: Range = (0.18, 0.36)
+    blue_over_green: Range = (0.72, 0.98)
+    variety: Range = (0.1, 0.4)
+    """How far organs, folds and patches of one scene leave its palette; 0 is one colour."""
+    specular: Range = (0.15, 0.5)
+    shininess: Range = (30.0, 80.0)
+    bump: Range = (0.03, 0.09)
+    """Root mean square slope of the fine relief, which breaks up the highlights."""
+    mottle: Range = (0.05, 0.16)
+    """Relative strength of the blotches, whose size is in millimetres."""
+    spots: Range = (0.0, 0.0)
+    """Relative strength of small dark spots."""
+    vessels: Range = (25.0, 60.0)
+    """Vessel trees a scene."""
+    vessel_contrast: Range = (0.25, 0.6)
+
+
+class CameraRanges(_Ranges):
+    """Lens and hand."""
+
+    fov_deg: Range = (65.0, 100.0)
+    """Horizontal field of view; drawn evenly in its tangent's logarithm."""
+    speed: Range = (0.7, 1.3)
+    """1 moves about 3 % of the mean depth a frame; narrow views move less."""
+    motions: dict[Motion, float] = {"forward": 0.4, "sideways": 0.3, "turning": 0.25, "still": 0.05}
+    """Weights of the kinds of path."""
+
+
+class SensorRanges(_Ranges):
+    """From radiance to eight bits."""
+
+    gamma: Range = (2.2, 2.2)
+    exposure: Range = (0.42, 0.55)
+    """Displayed brightness that the automatic exposure steers the 60th percentile to."""
+    lag: Range = (0.0, 0.5)
+    """Share of the last gain that the automatic exposure keeps a frame."""
+    vignette: Range = (0.0, 0.4)
+    """Loss of light in the corners."""
+    clipping: Range = (1.0, 1.1)
+    """Gain before the sensor saturates."""
+    shoulder: Range = (0.3, 0.8)
+    """How softly highlights roll off; 0 clips hard."""
+    noise: Range = (0.002, 0.012)
+    """Standard deviation at middle grey."""
+    blur_px: Range = (0.0, 0.5)
+    """Standard deviation of the blur, for an image 140 pixels wide."""
+    blurred: Share = 0.3
+    round_view: Share = 0.0
+    """Share of clips that show a round (or corner-cut) field of view; outside is black and not valid."""
+    compressed: Share = 0.0
+    """Share of clips that went through JPEG."""
+    quality: Range = (60.0, 95.0)
+
+
+class Domain(_Ranges):
+    """One rendered domain; the defaults are the source domain that the small model starts on."""
+
+    name: str
+    families: dict[Family, float] = {"lumen": 0.5, "cavity": 0.5}
+    """Weights of the kinds of scene."""
+    light: LightRanges = LightRanges()
+    material: MaterialRanges = MaterialRanges()
+    camera: CameraRanges = CameraRanges()
+    sensor: SensorRanges = SensorRanges()
+
+    @model_validator(mode="after")
+    def _something_to_draw(self) -> Self:
+        for what, weights in (("families", self.families), ("camera.motions", self.camera.motions)):
+            if min(weights.values(), default=0.0) < 0 or sum(weights.values()) <= 0:
+                raise ValueError(f"{what} needs weights of at least 0 with a positive sum, got {weights}")
+        return self
+
+    @classmethod
+    def from_file(cls, path: Path) -> Self:
+        """Read a domain from a JSON file; what the file leaves out keeps its default.
+
+        Raises:
+            SettingsError: If the file cannot be read or holds something else.
+        """
+        try:
+            return cls.model_validate(json.loads(path.read_text(encoding="utf-8")))
+        except (OSError, json.JSONDecodeError, ValidationError) as error:
+            raise SettingsError(f"{path}: not a domain of rendered clips: {error}") from error
+
+
+def draw(random: np.random.Generator, bounds: tuple[float, float]) -> float:
+    """A number from a range."""
+    return float(random.uniform(*bounds))
+
+
+def choose(random: np.random.Generator, weights: Mapping[Name, float]) -> Name:
+    """A key, as often as its weight says; independent of the order in which the file lists them."""
+    names = sorted(weights)
+    share = np.array([weights[name] for name in names])
+    return names[int(random.choice(len(names), p=share / share.sum()))]

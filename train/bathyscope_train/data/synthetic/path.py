@@ -1,0 +1,142 @@
+"""Smooth camera paths through a scene: forwards, sideways, turning, nearly still."""
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from bathyscope.errors import GeometryError
+from bathyscope_train.data.synthetic.domain import CameraRanges, choose, draw
+from bathyscope_train.data.synthetic.kernels import clearance
+from bathyscope_train.data.synthetic.scene import TUBE, Scene, Surface
+
+Array = npt.NDArray[np.float64]
+
+
+class _Manner(NamedTuple):
+    """How far a kind of path goes along the view, across it, and round, against the usual."""
+
+    along: float
+    across: float
+    turn: float
+
+
+_MANNERS = {
+    "forward": _Manner(1.3, 0.5, 0.6),
+    "sideways": _Manner(0.35, 1.6, 0.7),
+    "turning": _Manner(0.5, 0.5, 1.6),
+    "still": _Manner(0.05, 0.08, 0.15),
+}
+_SHARE_PER_FRAME = 0.03  # of the mean depth, moved in one frame at speed 1
+_TURN_DEG = 11.0  # amplitude of the slow swing at speed 1 and a view of 80 degrees
+
+
+def _swing(random: np.random.Generator, frames: int, periods: tuple[float, float] = (26.0, 60.0)) -> Array:
+    """A smooth signal of amplitude about 1 with value 0 at the first frame."""
+    time = np.arange(frames)
+    signal = np.zeros(frames)
+    for share in (0.75, 0.35):
+        phase, period = random.uniform(0, 2 * np.pi), random.uniform(*periods) * (1.0 if share > 0.5 else 0.5)
+        signal += share * (np.sin(2 * np.pi * time / period + phase) - np.sin(phase))
+    return signal
+
+
+def _look(forward: Array, yaw: Array, pitch: Array, roll: Array) -> Array:
+    """Rotations ``(t, 3, 3)`` whose z axis is ``forward`` turned by yaw, pitch and roll (radians)."""
+    forward = forward / np.linalg.norm(forward, axis=-1, keepdims=True)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right, axis=-1, keepdims=True)
+    frame = np.stack([right, np.cross(forward, right), forward], axis=-1)
+    one, zero = np.ones_like(yaw), np.zeros_like(yaw)
+
+    def turn(rows: list[Array]) -> Array:
+        return np.stack(rows, axis=-1).reshape(-1, 3, 3)
+
+    cy, sy, cp, sp, cr, sr = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+    yawed = turn([cy, zero, sy, zero, one, zero, -sy, zero, cy])
+    pitched = turn([one, zero, zero, zero, cp, -sp, zero, sp, cp])
+    rolled = turn([cr, -sr, zero, sr, cr, zero, zero, zero, one])
+    return frame @ yawed @ pitched @ rolled
+
+
+def camera_path(random: np.random.Generator, scene: Scene, ranges: CameraRanges, fov_deg: float, frames: int) -> Array:
+    """Draw a path of poses, ``scene_from_camera`` ``(t, 4, 4)``.
+
+    Args:
+        random: Source of every choice.
+        scene: Where the camera moves.
+        ranges: Speeds and kinds of path.
+        fov_deg: Horizontal field of view; narrow views move and turn less.
+        frames: Length of the path.
+    """
+    manner = _MANNERS[choose(random, ranges.motions)]
+    pace = draw(random, ranges.speed) * min(1.0, fov_deg / 80.0)
+    place = _through_tube if scene.surface.kind == TUBE else _over_field
+    positions, forward = place(random, scene.surface, manner, pace, frames)
+
+    swing = np.radians(_TURN_DEG) * manner.turn * pace
+    gaze = np.radians(fov_deg) * 0.22
+    yaw = swing * _swing(random, frames) + random.uniform(-gaze, gaze)
+    pitch = swing * _swing(random, frames) + random.uniform(-gaze, gaze)
+    roll = 1.2 * swing * _swing(random, frames) + random.uniform(-np.pi, np.pi)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, :3] = _look(forward, yaw, pitch, roll)
+    poses[:, :3, 3] = positions
+    return poses
+
+
+def _keep_clear(surface: Surface, base: Array, offset: Array, margin_mm: float) -> Array:
+    """Positions ``base + offset``, the offset shrunk until every one is ``margin_mm`` from the wall."""
+    for share in (1.0, 0.75, 0.5, 0.3, 0.15, 0.0):
+        positions = base + share * offset
+        if min(clearance(surface, point) for point in positions) >= margin_mm:
+            return positions
+    raise GeometryError(
+        f"no camera path keeps {margin_mm:.1f} mm from the walls; widen the lumen or lower its folds and polyps"
+    )
+
+
+def _through_tube(
+    random: np.random.Generator, surface: Surface, manner: _Manner, pace: float, frames: int
+) -> tuple[Array, Array]:
+    rows = len(surface.centre)
+    z = surface.first[0] + surface.step[0] * np.arange(rows)
+    radius = float(np.median(surface.heights[rows // 4 : -rows // 4]))
+    step = _SHARE_PER_FRAME * 2.2 * radius * pace * manner.along
+    ends = z[0] + 1.6 * radius, z[-1] - 2.2 * radius
+    travel = min(step * frames, ends[1] - ends[0]) * (-1.0 if random.uniform() < 0.3 else 1.0)
+    start = random.uniform(ends[0] + max(0.0, -travel), ends[1] - max(0.0, travel))
+    ease = 0.15 * abs(travel) * _swing(random, frames) / max(1.0, frames / 8)
+    along = np.clip(start + travel * np.arange(frames) / max(1, frames) + ease, *ends)
+
+    def centre(at: Array) -> Array:
+        return np.stack([np.interp(at, z, surface.centre[:, axis]) for axis in range(2)] + [at], axis=-1)
+
+    offset = np.zeros((frames, 3))
+    for axis in range(2):
+        amplitude = 0.22 * radius * pace * manner.across
+        offset[:, axis] = amplitude * _swing(random, frames) + random.uniform(-0.3, 0.3) * radius
+    base = centre(along)
+    positions = _keep_clear(surface, base, offset, 0.12 * radius)
+    return positions, centre(along + random.uniform(1.6, 3.0) * radius) - positions
+
+
+def _over_field(
+    random: np.random.Generator, surface: Surface, manner: _Manner, pace: float, frames: int
+) -> tuple[Array, Array]:
+    extent = surface.step[0] * surface.heights.shape[0]
+    middle = float(np.median(surface.heights))
+    distance = random.uniform(0.18, 0.36) * extent
+    step = _SHARE_PER_FRAME * distance * pace
+    target = np.append(random.uniform(-0.14, 0.14, 2) * extent, middle)
+    base = np.append(random.uniform(-0.12, 0.12, 2) * extent, middle - distance)
+    offset = np.zeros((frames, 3))
+    for axis, share in enumerate((manner.across, manner.across, manner.along)):
+        drift = random.choice([-1.0, 1.0]) * random.uniform(0.3, 1.0) * np.arange(frames)
+        offset[:, axis] = step * share * (0.6 * drift + 4.0 * _swing(random, frames))
+    limit = 0.6 * distance
+    offset *= min(1.0, limit / max(1e-6, float(np.abs(offset).max())))
+    floor = min(clearance(surface, base + share * point) for share in (0.0, 0.3, 1.0) for point in offset)
+    base[2] -= max(0.0, 0.08 * extent - floor)
+    positions = _keep_clear(surface, np.tile(base, (frames, 1)), offset, 0.05 * extent)
+    return positions, target - positions
