@@ -3,5 +3,6 @@
 from bathyscope_train.data.synthetic.clip import SyntheticClip, render_clip
 from bathyscope_train.data.synthetic.domain import Domain
 from bathyscope_train.data.synthetic.domains import DOMAINS
+from bathyscope_train.data.synthetic.shards import clip_paths, read_clip, write_clips
 
-__all__ = ["DOMAINS", "Domain", "SyntheticClip", "render_clip"]
+__all__ = ["DOMAINS", "Domain", "SyntheticClip", "clip_paths", "read_clip", "render_clip", "write_clips"]

@@ -35,7 +35,7 @@ def cavity(random: np.random.Generator, material: MaterialRanges) -> Scene:
         albedo[wins] = colour
         heights = np.minimum(heights, organ)
     folds = periodic_noise(random, (_SAMPLES, _SAMPLES), (step, step), grain_mm=extent / 24)
-    heights += np.float32(0.003 * extent * folds)
+    heights += np.float32(0.0017 * extent * folds)
     heights -= _wall(random, x, y, extent)
     heights = cv2.GaussianBlur(heights, (0, 0), 1.4, borderType=cv2.BORDER_REPLICATE)
     albedo = cv2.GaussianBlur(albedo, (0, 0), 1.2)
@@ -63,8 +63,8 @@ def _organ(random: np.random.Generator, x: Array, y: Array, ground: Array, exten
     along, across = x - np.float32(centre[0]), y - np.float32(centre[1])
     inside = 1.0 - ((cosine * along + sine * across) / size[0]) ** 2 - ((cosine * across - sine * along) / size[1]) ** 2
     foot = float(np.median(ground))
-    height = random.uniform(0.35, 0.95) * float(size.min())
-    top = foot + 0.2 * height - height * np.sqrt(np.clip(inside, 0.0, 1.0)) - random.uniform(0.0, 0.04) * extent
+    height = random.uniform(0.5, 1.3) * float(size.min())
+    top = foot + 0.2 * height - height * np.sqrt(np.clip(inside, 0.0, 1.0)) - random.uniform(0.0, 0.06) * extent
     return np.float32(np.where(inside > 0, top, np.inf))
 
 

@@ -233,7 +233,7 @@ def _shade(
         if half > 0:
             highlight += power * half ** (10.0 * shininess) * (shininess + 2.0) / (tissue.shininess + 2.0)
     scattered = lamp.ambient * (20.0 / (distance + 5.0))
-    highlight *= 2.5 * tissue.specular
+    highlight *= 7.0 * tissue.specular
     for q in range(3):
         bounced = scattered * out[q] * (1.3 if q == 0 else 1.0)
         out[q] = out[q] * open_space * (direct + bounced) + highlight

@@ -126,15 +126,15 @@ def _over_field(
 ) -> tuple[Array, Array]:
     extent = surface.step[0] * surface.heights.shape[0]
     middle = float(np.median(surface.heights))
-    distance = random.uniform(0.18, 0.36) * extent
-    step = _SHARE_PER_FRAME * distance * pace
+    distance = random.uniform(0.12, 0.34) * extent
+    step = 1.9 * _SHARE_PER_FRAME * distance * pace
     target = np.append(random.uniform(-0.14, 0.14, 2) * extent, middle)
     base = np.append(random.uniform(-0.12, 0.12, 2) * extent, middle - distance)
     offset = np.zeros((frames, 3))
     for axis, share in enumerate((manner.across, manner.across, manner.along)):
         drift = random.choice([-1.0, 1.0]) * random.uniform(0.3, 1.0) * np.arange(frames)
         offset[:, axis] = step * share * (0.6 * drift + 4.0 * _swing(random, frames))
-    limit = 0.6 * distance
+    limit = 0.9 * distance
     offset *= min(1.0, limit / max(1e-6, float(np.abs(offset).max())))
     floor = min(clearance(surface, base + share * point) for share in (0.0, 0.3, 1.0) for point in offset)
     base[2] -= max(0.0, 0.08 * extent - floor)
