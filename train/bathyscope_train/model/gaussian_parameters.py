@@ -101,12 +101,14 @@ def footprint_gaussians(
 
 def map_opacity(probability: Tensor, exponent: float) -> Tensor:
     """AnySplat's opacity mapping: 0.5 (1 - (1-p)^e + p^(1/e)), e = 2^exponent; exponent 0 changes nothing."""
-    power = 2.0**exponent
-    return 0.5 * (1 - (1 - probability) ** power + probability ** (1 / power))
+    power: float = 2.0**exponent
+    mapped: Tensor = 0.5 * (1 - (1 - probability) ** power + probability ** (1 / power))
+    return mapped
 
 
 def _colour(raw: Float[Tensor, "*n g"]) -> Float[Tensor, "*n k 3"]:
     """Raw colour channels, damped by degree: 1 for the constant, 0.1 * 0.25^l above."""
     count = (raw.shape[-1] - 8) // 3
     damping = [1.0 if k == 0 else 0.1 * 0.25 ** isqrt(k) for k in range(count)]
-    return raw[..., 8:].unflatten(-1, (3, count)).transpose(-1, -2) * raw.new_tensor(damping)[:, None]
+    coefficients: Tensor = raw[..., 8:].unflatten(-1, (3, count)).transpose(-1, -2)
+    return coefficients * raw.new_tensor(damping)[:, None]

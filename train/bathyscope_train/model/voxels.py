@@ -1,6 +1,6 @@
 """Voxel fusion: Gaussians that share a cell of space become one, weighted by their confidence."""
 
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
@@ -12,7 +12,8 @@ PADDED_FEATURE = -1e10
 """Raw features of the filling: they activate to opacity 0 and scale 0."""
 
 
-class Fused(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class Fused:
     """Occupied voxels of one scene, sorted by (x, y, z) index."""
 
     points: Float[Tensor, "v 3"]
