@@ -73,4 +73,5 @@ def _wall(random: np.random.Generator, x: Array, y: Array, extent: float) -> Arr
     stretch = random.uniform(0.8, 1.25)
     radius = np.sqrt((x * stretch) ** 2 + (y / stretch) ** 2) / extent
     beyond = np.clip((radius - random.uniform(0.3, 0.36)) / 0.14, 0.0, None)
-    return np.float32(0.75 * extent * beyond**1.8)
+    border = np.clip((np.maximum(np.abs(x), np.abs(y)) / extent - 0.38) / 0.08, 0.0, None)
+    return np.float32(0.75 * extent * np.maximum(beyond, border) ** 1.8)

@@ -27,7 +27,7 @@ class SyntheticClip:
     depth: npt.NDArray[np.float32]
     """``(t, h, w)``: z-depth of the ray through each pixel's centre; 0 outside the field of view."""
     valid: npt.NDArray[np.bool_]
-    """``(t, h, w)``: inside the field of view."""
+    """``(t, h, w)``: inside the field of view, and the scene is there."""
     world_from_camera: npt.NDArray[np.float64]
     """``(t, 4, 4)``, OpenCV axes; the first is the identity."""
     intrinsics: npt.NDArray[np.float64]
@@ -73,7 +73,7 @@ def render_clip(seed: int, domain: Domain, *, frames: int = 16, size: tuple[int,
     radiance, depth = np.empty((frames, *size, 3), np.float32), np.empty((frames, *size), np.float32)
     for index, pose in enumerate(poses):
         radiance[index], depth[index] = render(scene.surface, scene.tissue, lamp, pose, intrinsics, size)
-    valid = np.broadcast_to(sensor.view >= 0.5, depth.shape).copy()
+    valid = (sensor.view >= 0.5) & (depth > 0)
     world_from_camera = np.linalg.inv(poses[0]) @ poses
     world_from_camera[0] = np.eye(4)
     return SyntheticClip(

@@ -19,6 +19,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 _NEAREST_MM = 0.3
 _BISECTIONS = 16
+_ON_SURFACE_MM = 0.05  # a ray that ends further from it has left the map
 _CREST = 0.35  # share of light that a crease keeps
 
 
@@ -252,7 +253,8 @@ def render_frame(
 ) -> None:
     """Render one frame into ``radiance`` (h, w, 3) and ``depth`` (h, w).
 
-    Depth is that of the ray through the pixel's centre. Colour is that ray's too, but where depth
+    Depth is that of the ray through the pixel's centre, 0 where it left the map. Colour is that ray's too, but
+    where depth
     jumps, the view grazes the surface or a highlight sits, it is the mean of four rays a pixel.
     """
     height, width = depth.shape
@@ -291,7 +293,7 @@ def _ray(
     coarse: Array,
     colour: Array,
 ) -> float:
-    """Trace and shade the ray through image point (u, v); returns its z-depth."""
+    """Trace and shade the ray through image point (u, v); returns its z-depth, 0 if it left the map."""
     a = (u - intrinsics[0, 2]) / intrinsics[0, 0]
     b = (v - intrinsics[1, 2]) / intrinsics[1, 1]
     slant = np.sqrt(a * a + b * b + 1.0)
@@ -303,7 +305,7 @@ def _ray(
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
     footprint = t / intrinsics[0, 0]
     _shade(surface, tissue, lamp, camera, x, y, z, t, footprint, grain, coarse, colour)
-    return t / slant
+    return t / slant if abs(free_depth(surface, x, y, z)) < _ON_SURFACE_MM else 0.0
 
 
 def clearance(surface: Surface, point: npt.NDArray[np.float64]) -> float:

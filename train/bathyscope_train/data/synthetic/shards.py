@@ -26,7 +26,6 @@ def write_clip(path: Path, clip: SyntheticClip) -> None:
             format=np.int64(_FORMAT),
             frames=clip.frames,
             depth=clip.depth.astype(np.float16),
-            view=clip.valid[0],
             world_from_camera=clip.world_from_camera,
             intrinsics=clip.intrinsics,
             name=np.array(clip.name),
@@ -47,11 +46,11 @@ def read_clip(path: Path) -> SyntheticClip:
             found = int(file["format"])
             if found != _FORMAT:
                 raise DatasetError(f"{path}: clip format {found}, this build reads {_FORMAT}; render the clips again")
-            frames = file["frames"]
+            depth = file["depth"].astype(np.float32)
             return SyntheticClip(
-                frames=frames,
-                depth=file["depth"].astype(np.float32),
-                valid=np.broadcast_to(file["view"], frames.shape[:3]).copy(),
+                frames=file["frames"],
+                depth=depth,
+                valid=depth > 0,
                 world_from_camera=file["world_from_camera"],
                 intrinsics=file["intrinsics"],
                 name=str(file["name"]),
