@@ -1,0 +1,1 @@
+"""Routes: each turns HTTP into one call and a typed answer."""
