@@ -1,0 +1,1 @@
+"""Evaluation in numpy: depth errors, trajectories, naive baselines, data set folders. Needs no torch."""
