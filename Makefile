@@ -1,0 +1,56 @@
+# Needs Python 3.11 or newer and make. Everything else is installed here: .venv for development, .venv-demo for the demo.
+#
+#   make demo [CLIP=video]   a clip through service and client; outputs in demo/
+#   make test                the whole test suite        make quick   without the slow tests
+#   make check               style, types, layers, spelling
+#   make clean               remove what these commands installed and cached
+
+.DEFAULT_GOAL := help
+.PHONY: help demo test quick check format clean
+
+CANDIDATES := python3 python3.11 python3.12 python3.13 python3.14 python
+PYTHON ?= $(shell for p in $(CANDIDATES); do \
+	"$$p" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && { echo "$$p"; break; }; done)
+
+BIN := .venv/bin
+INSTALL := -m pip install --disable-pip-version-check --quiet --constraint constraints.txt
+export OMP_NUM_THREADS ?= 1
+
+help:
+	@sed -n 's/^#   //p' Makefile
+
+demo: .venv-demo/installed
+	@.venv-demo/bin/bathyscope demo --out demo $(if $(CLIP),'$(CLIP)')
+
+test: .venv/installed
+	$(BIN)/python -m pytest -n 2 --quiet --durations 8
+
+quick: .venv/installed
+	$(BIN)/python -m pytest -n 2 --quiet -m 'not slow'
+
+check: .venv/installed
+	$(BIN)/ruff check --quiet .
+	$(BIN)/ruff format --quiet --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/codespell
+
+format: .venv/installed
+	$(BIN)/ruff check --quiet --fix .
+	$(BIN)/ruff format --quiet .
+
+.venv/installed: EXTRAS := dev
+.venv-demo/installed: EXTRAS := serve
+
+.venv/installed .venv-demo/installed: pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "Python 3.11 or newer is needed; none of these is one: $(CANDIDATES)." \
+		"Install it, or name it: make PYTHON=/path/to/python3.11" >&2; exit 1; }
+	@echo "installing bathyscope[$(EXTRAS)] into $(@D) with $$($(PYTHON) --version); the first time takes a few minutes"
+	@test -x $(@D)/bin/python || $(PYTHON) -m venv $(@D) || { rm -rf $(@D); \
+		echo "$(PYTHON) cannot make a virtual environment; on Debian: apt-get install python3-venv" >&2; exit 1; }
+	@$(@D)/bin/python $(INSTALL) --editable '.[$(EXTRAS)]'
+	@touch $@
+
+clean:
+	rm -rf .venv .venv-demo .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	find core train export serve clients tests benchmarks -name __pycache__ -prune -exec rm -rf {} +
