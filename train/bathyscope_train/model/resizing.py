@@ -1,6 +1,6 @@
 """Antialiased bicubic resizing as two matrix products.
 
-Same values as ``F.interpolate(mode="bicubic", antialias=True, align_corners=False)``. ONNX's ``Resize`` is
+Same values as Pillow and ``F.interpolate(mode="bicubic", antialias=True, align_corners=False)``. ONNX's ``Resize`` is
 exported with another cubic coefficient for that call; matrix products export exactly, for sizes known only
 at run time.
 """
