@@ -5,7 +5,7 @@ The world is that of the window's first camera: pose 0 is the identity, and the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +121,7 @@ def assemble_scene(
     *,
     valid: NDArray[np.bool_] | None = None,
     first_is_identity: bool = True,
+    colour: bool = True,
 ) -> Scene:
     """Decode cameras, unproject depth, and activate (and, where the bundle says so, fuse) the Gaussians.
 
@@ -129,6 +130,7 @@ def assemble_scene(
         images: (t, 3, h, w) RGB in [0, 1], what the network saw.
         spec: The bundle's reading of the raw maps.
         valid: (t, h, w) pixels that may become Gaussians; all unless given.
+        colour: Whether the Gaussians get their colours; without, they keep one grey constant term.
         first_is_identity: Re-express everything in the first camera's world. Off, the world is the network's own.
 
     Raises:
@@ -139,6 +141,8 @@ def assemble_scene(
     keep = np.ones(maps.depth.shape, np.bool_) if valid is None else valid
     if keep.shape != maps.depth.shape or images.shape != (len(keep), 3, *maps.size):
         raise GeometryError(f"maps {maps.depth.shape} do not fit images {images.shape} and valid {keep.shape}")
+    if not colour:
+        maps = replace(maps, gaussians=np.concatenate([maps.gaussians[:, :11], maps.gaussians[:, -1:]], 1))
     if spec.activation == "anysplat":
         gaussians = _fused(maps, points, keep, spec)
     else:

@@ -1,0 +1,52 @@
+"""Settings of the depth engine; every result carries the ones it was made with."""
+
+from __future__ import annotations
+
+from typing import Self
+
+from pydantic import BaseModel, Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from bathyscope_serve.decode_limits import DecodeLimits
+
+
+class StitchSettings(BaseModel, frozen=True, extra="forbid"):
+    """When two windows are believed to show one world."""
+
+    rotation_spread_deg: PositiveFloat = Field(
+        default=20.0, description="Median disagreement of the shared cameras' rotations that is still an alignment."
+    )
+    depth_spread: PositiveFloat = Field(
+        default=0.5, description="Median absolute deviation of the log depth ratio that is still an alignment."
+    )
+    least_share: PositiveFloat = Field(default=0.05, description="Share of the pixels that the scale must rest on.")
+
+
+class CutSettings(BaseModel, frozen=True, extra="forbid"):
+    """When two neighbouring frames are taken for different scenes."""
+
+    histogram: PositiveFloat = Field(default=0.45, description="Share of pixels that change their colour cell.")
+    correlation: float = Field(default=0.35, description="Correlation of the small grey images below this.")
+    surprise: PositiveFloat = Field(default=3.0, description="Times the usual change of the last frames.")
+
+
+class EngineSettings(BaseModel, frozen=True, extra="forbid"):
+    """How clips are run through a bundle."""
+
+    threads: PositiveInt | None = Field(default=None, description="Threads of the network; all cores unless given.")
+    render_threads: PositiveInt = Field(default=2, description="Frames splatted at the same time.")
+    head_chunk: PositiveInt = Field(default=4, description="Frames that the dense heads run on at once.")
+    window: PositiveInt | None = Field(default=None, description="Frames of a window; the bundle's unless given.")
+    overlap: PositiveInt | None = Field(default=None, description="Shared frames; the bundle's unless given.")
+    pixels: PositiveInt | None = Field(default=None, description="Area the network sees; the bundle's unless given.")
+    least_opacity: NonNegativeFloat = Field(
+        default=0.5, le=1.0, description="Rendered depth below this opacity is replaced by the depth head's."
+    )
+    stitch: StitchSettings = StitchSettings()
+    cuts: CutSettings = CutSettings()
+    decode: DecodeLimits = DecodeLimits()
+
+    @model_validator(mode="after")
+    def _windows_advance(self) -> Self:
+        if self.window is not None and self.overlap is not None and self.overlap >= self.window:
+            raise ValueError(f"overlap ({self.overlap}) must be smaller than window ({self.window})")
+        return self

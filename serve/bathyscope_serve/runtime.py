@@ -1,0 +1,118 @@
+"""Run the graphs of a bundle with ONNX Runtime: RGB frames in, raw maps and pose encodings out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+import onnxruntime as ort
+from numpy.typing import NDArray
+
+from bathyscope.bundle import Bundle, BundleManifest, GraphSpec, Role
+from bathyscope.errors import BundleError, GeometryError
+from bathyscope.scene import WindowMaps
+from bathyscope_serve.engine_settings import EngineSettings
+
+F32 = NDArray[np.float32]
+Tensors = dict[str, NDArray[Any]]
+
+
+def keep_going() -> None:
+    """The default of ``checkpoint``: nothing stops the run."""
+
+
+class DepthModel(Protocol):
+    """A network that sees a window of frames at once."""
+
+    def predict(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> WindowMaps:
+        """Maps and pose encodings of frames (t, 3, h, w) in [0, 1]; safe to call from several threads.
+
+        Args:
+            images: h and w multiples of the bundle's patch.
+            checkpoint: Called between the parts of the work; an exception from it ends the run.
+        """
+        ...
+
+
+class OnnxModel:
+    """The three graphs of a bundle: backbone, heads in chunks of frames, cameras.
+
+    Raises:
+        BundleError: If ONNX Runtime cannot load a graph, or its inputs and outputs are not those of the manifest.
+    """
+
+    def __init__(self, bundle: Bundle, settings: EngineSettings) -> None:
+        self._manifest: BundleManifest = bundle.manifest
+        self._chunk = settings.head_chunk
+        options = session_options(settings.threads)
+        self._sessions = {role: _load(bundle, role, options) for role in bundle.manifest.graphs}
+
+    def predict(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> WindowMaps:
+        """See :class:`DepthModel`.
+
+        Raises:
+            GeometryError: If the outputs are not finite or of the wrong shape.
+            BundleError: If a graph fails on this input.
+        """
+        known: Tensors = {"images": np.ascontiguousarray(images, np.float32)}
+        known |= self._run("backbone", known)
+        checkpoint()
+        known |= self._heads(known, checkpoint)
+        checkpoint()
+        known |= self._run("cameras", known)
+        t, h, w = len(images), *images.shape[2:]
+        maps = {name: known[name] for name in ("depth", "confidence", "gaussians", "pose_encoding")}
+        if maps["depth"].shape != (t, h, w):
+            raise GeometryError(f"the network's depth has shape {maps['depth'].shape}, {(t, h, w)} was needed")
+        return WindowMaps(**{name: np.asarray(value, np.float32) for name, value in maps.items()})
+
+    def _heads(self, known: Tensors, checkpoint: Callable[[], None]) -> Tensors:
+        """Dense heads, a few frames at a time: their activations are the other peak of memory."""
+        names = self._graph("heads").inputs
+        frames = len(known["images"])
+        parts: list[Tensors] = []
+        for start in range(0, frames, self._chunk):
+            checkpoint()
+            parts.append(self._run("heads", {name: known[name][start : start + self._chunk] for name in names}))
+        return {name: np.concatenate([part[name] for part in parts]) for name in self._graph("heads").outputs}
+
+    def _run(self, role: Role, known: Tensors) -> Tensors:
+        graph = self._graph(role)
+        try:
+            values = self._sessions[role].run(list(graph.outputs), {name: known[name] for name in graph.inputs})
+        except Exception as error:  # ONNX Runtime raises classes of its own that share no base
+            raise BundleError(f"graph {graph.file} failed on {known['images'].shape} images: {error}") from error
+        return dict(zip(graph.outputs, values, strict=True))
+
+    def _graph(self, role: Role) -> GraphSpec:
+        return self._manifest.graphs[role]
+
+
+def session_options(threads: int | None) -> ort.SessionOptions:
+    """Options for clips of any size beside other work: no spinning, no memory arena that only grows."""
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
+    options.inter_op_num_threads = 1
+    options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+    options.enable_cpu_mem_arena = False
+    options.enable_mem_pattern = False
+    options.log_severity_level = 3
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return options
+
+
+def _load(bundle: Bundle, role: Role, options: ort.SessionOptions) -> ort.InferenceSession:
+    graph, path = bundle.manifest.graphs[role], bundle.graph(role)
+    try:
+        session = ort.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # ONNX Runtime raises classes of its own that share no base
+        raise BundleError(f"{path}: ONNX Runtime {ort.__version__} cannot load this graph: {error}") from error
+    found = {entry.name for entry in session.get_inputs()}, {entry.name for entry in session.get_outputs()}
+    if found[0] != set(graph.inputs) or not set(graph.outputs) <= found[1]:
+        raise BundleError(
+            f"{path}: takes {sorted(found[0])} and gives {sorted(found[1])}; the manifest says {list(graph.inputs)} "
+            f"and {list(graph.outputs)}"
+        )
+    return session
