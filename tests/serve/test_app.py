@@ -11,6 +11,7 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+import structlog
 from fake_engine import BREAKS, NOT_A_CLIP, FakeEngine, plane
 
 from bathyscope.result_files import load_npz
@@ -291,3 +292,19 @@ class FullDisk(FakeEngine):
 
 def test_a_full_disk_is_507(tmp_path: Path) -> None:
     assert post(tmp_path, FullDisk(), content=b"v", headers=MP4).status_code == 507
+
+
+def test_the_log_has_one_line_a_request_without_content(tmp_path: Path) -> None:
+    with structlog.testing.capture_logs() as lines:
+        post(tmp_path, content=b"patient data", headers={**MP4, "x-request-id": "abc"})
+    (line,) = [line for line in lines if line["event"] == "request"]
+    assert (line["request_id"], line["status"], line["bytes_in"], line["frames"]) == ("abc", 200, 12, 4)
+    assert "patient" not in str(lines)
+
+
+def test_a_failure_is_logged_with_its_reason(tmp_path: Path) -> None:
+    with structlog.testing.capture_logs() as lines:
+        answer = post(tmp_path, content=BREAKS, headers=MP4)
+    (failure,) = [line for line in lines if line["event"] == "request_failed"]
+    assert failure["request_id"] == answer.json()["request_id"]
+    assert "secret inner detail" in str(failure["exc_info"])

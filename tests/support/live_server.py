@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import structlog
 import uvicorn
 from fastapi import FastAPI
 
@@ -21,11 +22,12 @@ def live_server(app: FastAPI, header_timeout_s: float = 10.0) -> Iterator[tuple[
     thread = threading.Thread(target=server.run, kwargs={"sockets": [listening]})
     thread.start()
     try:
-        while not (server.started and app.state.service.state != "starting"):
-            time.sleep(0.005)
-            assert thread.is_alive(), "the server ended before it was ready"
-        host, port = listening.getsockname()[:2]
-        yield host, port
+        with structlog.testing.capture_logs():
+            while not (server.started and app.state.service.state != "starting"):
+                time.sleep(0.005)
+                assert thread.is_alive(), "the server ended before it was ready"
+            host, port = listening.getsockname()[:2]
+            yield host, port
     finally:
         server.should_exit = True
         thread.join(20)
