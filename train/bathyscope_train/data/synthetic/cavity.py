@@ -6,7 +6,7 @@ import numpy.typing as npt
 
 from bathyscope_train.data.synthetic.domain import MaterialRanges
 from bathyscope_train.data.synthetic.noise import periodic_noise
-from bathyscope_train.data.synthetic.scene import FIELD, Scene, Surface
+from bathyscope_train.data.synthetic.scene import FIELD, Scene, make_surface
 from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette
 
 Array = npt.NDArray[np.float32]
@@ -39,10 +39,9 @@ def cavity(random: np.random.Generator, material: MaterialRanges) -> Scene:
     heights -= _wall(random, x, y, extent)
     heights = cv2.GaussianBlur(heights, (0, 0), 1.4, borderType=cv2.BORDER_REPLICATE)
     albedo = cv2.GaussianBlur(albedo, (0, 0), 1.2)
-    surface = Surface(
-        kind=FIELD,
-        heights=np.ascontiguousarray(heights, np.float32),
-        centre=np.zeros((2, 2), np.float32),
+    surface = make_surface(
+        FIELD,
+        heights,
         first=(float(axis[0]), float(axis[0])),
         step=(step, step),
         stride_mm=2.5,

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_va
 
 from bathyscope.errors import SettingsError
 
-Family = Literal["lumen", "cavity", "sinus", "box"]
+Family = Literal["lumen", "cavity", "sinus"]
 Name = TypeVar("Name", bound=str)
 Motion = Literal["forward", "sideways", "turning", "still"]
 

@@ -12,14 +12,16 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from bathyscope_train.data.synthetic.scene import TUBE, Surface, Tissue
+from bathyscope_train.data.synthetic.scene import BLOCK, TUBE, Surface, Tissue
 
 Array = npt.NDArray[np.float64]
 F = TypeVar("F", bound=Callable[..., Any])
 
 _NEAREST_MM = 0.3
-_BISECTIONS = 16
+_REFINEMENTS = 32
+_CLOSE_MM = 1e-4
 _ON_SURFACE_MM = 0.05  # a ray that ends further from it has left the map
+_SHEEN = 0.9  # cosine below which no highlight is left: its 100th power is 3e-5
 _CREST = 0.35  # share of light that a crease keeps
 
 
@@ -43,7 +45,7 @@ def _jit(function: F) -> F:
 def _place(surface: Surface, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Row, column and reach of a point; reach is its radius in a tube and its depth over a field."""
     if surface.kind == TUBE:
-        row = (z - surface.first[0]) / surface.step[0]
+        row = (z - surface.first[0]) * surface.density[0]
         last = surface.centre.shape[0] - 1
         i = min(max(int(row), 0), last - 1)
         s = min(max(row - i, 0.0), 1.0)
@@ -54,14 +56,20 @@ def _place(surface: Surface, x: float, y: float, z: float) -> tuple[float, float
             a = 2.0 - a
         elif dy < 0:
             a = 4.0 + a
-        return row, a / surface.step[1], np.sqrt(dx * dx + dy * dy)
-    return (y - surface.first[0]) / surface.step[0], (x - surface.first[1]) / surface.step[1], z
+        return row, a * surface.density[1], np.sqrt(dx * dx + dy * dy)
+    return (y - surface.first[0]) * surface.density[0], (x - surface.first[1]) * surface.density[1], z
 
 
 @_jit
 def free_depth(surface: Surface, x: float, y: float, z: float) -> float:
     """Positive in free space, zero on the surface; for a tube the distance to the wall within the slice."""
     row, column, reach = _place(surface, x, y, z)
+    return _free(surface, row, column, reach)
+
+
+@_jit
+def _free(surface: Surface, row: float, column: float, reach: float) -> float:
+    """``free_depth`` of a place."""
     rows, columns = surface.heights.shape
     if row < 0 or row > rows - 1:
         return -1.0 - reach
@@ -70,7 +78,7 @@ def free_depth(surface: Surface, x: float, y: float, z: float) -> float:
     if surface.kind == TUBE:
         j = int(column)
         t = column - j
-        j = j % columns
+        j = j if j < columns else 0
         k = j + 1 if j + 1 < columns else 0
     else:
         if column < 0 or column > columns - 1:
@@ -85,20 +93,30 @@ def free_depth(surface: Surface, x: float, y: float, z: float) -> float:
 
 
 @_jit
-def _trace(surface: Surface, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
-    """Distance along a unit ray to the surface."""
-    near, t = 0.0, _NEAREST_MM
+def _trace(surface: Surface, start: float, ox: float, oy: float, oz: float, dx: float, dy: float, dz: float) -> float:
+    """Distance along a unit ray to the surface, looked for from ``start``."""
+    near, t, leap = 0.0, start, 0.0
+    before = surface.stride_mm
     free = free_depth(surface, ox + t * dx, oy + t * dy, oz + t * dz)
     while free > 0 and t < 1000.0:
-        near = t
-        t += max(min(0.45 * free, surface.stride_mm), 0.12 * surface.stride_mm)
-        free = free_depth(surface, ox + t * dx, oy + t * dy, oz + t * dz)
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (near + t)
-        if free_depth(surface, ox + middle * dx, oy + middle * dy, oz + middle * dz) > 0:
-            near = middle
+        near, before = t, free
+        t += max(min(0.7 * free, surface.stride_mm), 0.2 * surface.stride_mm, min(0.5 * leap, surface.leap_mm))
+        row, column, reach = _place(surface, ox + t * dx, oy + t * dy, oz + t * dz)
+        free = _free(surface, row, column, reach)
+        leap = 0.0
+        if free > surface.stride_mm:
+            ring = 0 if surface.kind == TUBE else int(column) // BLOCK
+            leap = surface.core[int(row) // BLOCK, ring] - reach
+    for step in range(_REFINEMENTS):  # a secant, and a bisection now and then where it crawls
+        share = 0.5 if step % 4 == 3 else before / (before - free)
+        middle = near + share * (t - near)
+        value = free_depth(surface, ox + middle * dx, oy + middle * dy, oz + middle * dz)
+        if abs(value) < _CLOSE_MM:
+            return middle
+        if value > 0:
+            near, before = middle, value
         else:
-            t = middle
+            t, free = middle, value
     return 0.5 * (near + t)
 
 
@@ -116,13 +134,13 @@ def _normal(surface: Surface, x: float, y: float, z: float, h: float) -> tuple[f
 
 @_jit
 def _grain(solid: npt.NDArray[np.float32], u: float, v: float, w: float, out: Array) -> None:
-    """Trilinear look-up in the repeating block; coordinates in samples."""
+    """Trilinear look-up of the first channels in the repeating block; coordinates in samples."""
     n = solid.shape[0]
     i, j, k = int(np.floor(u)), int(np.floor(v)), int(np.floor(w))
     a, b, c = u - i, v - j, w - k
     i, j, k = i % n, j % n, k % n
     i1, j1, k1 = (i + 1) % n, (j + 1) % n, (k + 1) % n
-    for q in range(5):
+    for q in range(out.shape[0]):
         front = (1 - b) * ((1 - c) * solid[i, j, k, q] + c * solid[i, j, k1, q]) + b * (
             (1 - c) * solid[i, j1, k, q] + c * solid[i, j1, k1, q]
         )
@@ -194,7 +212,7 @@ def _shade(
 ) -> None:
     """Radiance of a surface point into ``out[:3]``, and how much of it is highlight into ``out[3]``."""
     cell = surface.step[0]
-    nx, ny, nz = _normal(surface, x, y, z, max(0.8 * cell, 0.4 * footprint))
+    nx, ny, nz = _normal(surface, x, y, z, max(1.5 * cell, 0.4 * footprint))
     scale = 1.0 / tissue.solid_step_mm
     _grain(tissue.solid, 0.27 * z * scale, 0.27 * x * scale, -0.27 * y * scale, coarse)
     _grain(tissue.solid, x * scale, y * scale, z * scale, grain)
@@ -231,7 +249,7 @@ def _shade(
         direct += power * max((facing + 0.15) / 1.15, 0.0)
         hx, hy, hz = lx + vx, ly + vy, lz + vz
         half = (mx * hx + my * hy + mz * hz) / (np.sqrt(hx * hx + hy * hy + hz * hz) + 1e-12)
-        if half > 0:
+        if half > _SHEEN:
             highlight += power * half ** (10.0 * shininess) * (shininess + 2.0) / (tissue.shininess + 2.0)
     scattered = lamp.ambient * (20.0 / (distance + 5.0))
     highlight *= 7.0 * tissue.specular
@@ -258,13 +276,14 @@ def render_frame(
     jumps, the view grazes the surface or a highlight sits, it is the mean of four rays a pixel.
     """
     height, width = depth.shape
-    grain, coarse, colour = np.empty(5), np.empty(5), np.empty(4)
+    grain, coarse, colour = np.empty(5), np.empty(1), np.empty(4)
     rough = np.zeros((height, width), np.bool_)
     for v in range(height):
         for u in range(width):
-            z = _ray(surface, tissue, lamp, camera, intrinsics, u + 0.5, v + 0.5, grain, coarse, colour)
+            z = _ray(surface, tissue, lamp, camera, intrinsics, _NEAREST_MM, u + 0.5, v + 0.5, grain, coarse, colour)
             depth[v, u] = z
-            radiance[v, u] = colour[:3]
+            for q in range(3):
+                radiance[v, u, q] = colour[q]
             rough[v, u] = colour[3] > 0.15
     for v in range(height):
         for u in range(width):
@@ -272,12 +291,13 @@ def render_frame(
             across = depth[v, max(u - 1, 0)] + depth[v, min(u + 1, width - 1)] - 2 * z
             along = depth[max(v - 1, 0), u] + depth[min(v + 1, height - 1), u] - 2 * z
             if rough[v, u] or abs(across) + abs(along) > 0.03 * z:
-                total = np.zeros(3)
+                start = max(_NEAREST_MM, 0.85 * (z - abs(across) - abs(along)))
+                radiance[v, u] = 0.0
                 for k in range(4):
                     du, dv = 0.25 + 0.5 * (k % 2), 0.25 + 0.5 * (k // 2)
-                    _ray(surface, tissue, lamp, camera, intrinsics, u + du, v + dv, grain, coarse, colour)
-                    total += colour[:3]
-                radiance[v, u] = 0.25 * total
+                    _ray(surface, tissue, lamp, camera, intrinsics, start, u + du, v + dv, grain, coarse, colour)
+                    for q in range(3):
+                        radiance[v, u, q] += 0.25 * colour[q]
 
 
 @_jit
@@ -287,6 +307,7 @@ def _ray(
     lamp: Lamp,
     camera: Array,
     intrinsics: Array,
+    start: float,
     u: float,
     v: float,
     grain: Array,
@@ -301,7 +322,7 @@ def _ray(
     dy = (camera[1, 0] * a + camera[1, 1] * b + camera[1, 2]) / slant
     dz = (camera[2, 0] * a + camera[2, 1] * b + camera[2, 2]) / slant
     ox, oy, oz = camera[0, 3], camera[1, 3], camera[2, 3]
-    t = _trace(surface, ox, oy, oz, dx, dy, dz)
+    t = _trace(surface, start, ox, oy, oz, dx, dy, dz)
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
     footprint = t / intrinsics[0, 0]
     _shade(surface, tissue, lamp, camera, x, y, z, t, footprint, grain, coarse, colour)

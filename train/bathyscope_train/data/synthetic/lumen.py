@@ -6,7 +6,7 @@ import numpy.typing as npt
 
 from bathyscope_train.data.synthetic.domain import MaterialRanges
 from bathyscope_train.data.synthetic.noise import periodic_noise
-from bathyscope_train.data.synthetic.scene import TUBE, Scene, Surface
+from bathyscope_train.data.synthetic.scene import TUBE, Scene, make_surface
 from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette
 
 Array = npt.NDArray[np.float32]
@@ -77,9 +77,9 @@ def colon(random: np.random.Generator, material: MaterialRanges) -> Scene:
         heights -= bump
         share = share + 0.8 * cover
     heights = np.maximum(_smooth(heights, 0.7), 0.3 * radius) * _taper(z, 18.0)
-    surface = Surface(
-        kind=TUBE,
-        heights=np.ascontiguousarray(heights, np.float32),
+    surface = make_surface(
+        TUBE,
+        heights,
         centre=centreline(random, z, random.uniform(0.1, 0.9), (90.0, 260.0)),
         first=(float(z[0]), 0.0),
         step=(0.4, 4.0 / _COLUMNS),
@@ -133,17 +133,17 @@ def sinus(random: np.random.Generator, material: MaterialRanges) -> Scene:
     base, other = palette(random, material), palette(random, material)
     share = np.zeros(heights.shape, np.float32) + 0.15 * np.clip(rough, 0, 1)
     for _ in range(int(random.integers(2, 6))):
-        length, breadth = random.uniform(6.0, 22.0), random.uniform(0.35, 0.85)
+        length, breadth = random.uniform(6.0, 22.0), random.uniform(0.45, 1.0)
         along = (z - random.uniform(0.0, z[-1] - 5.0))[:, None] / length
         swing = random.uniform(-0.5, 0.5)
         across = _angular(theta, random.uniform(0, 2 * np.pi)) / breadth + swing * along
         ridge = np.sin(np.pi / 2 * np.clip(1.0 - along**2 - across**2, 0.0, 1.0)) ** 0.85
-        heights = np.minimum(heights, heights * (1.0 - random.uniform(0.3, 0.72) * ridge))
+        heights = np.minimum(heights, heights * (1.0 - random.uniform(0.25, 0.6) * ridge))
         share = np.maximum(share, random.uniform(0.2, 1.0) * np.clip(2 * ridge, 0, 1))
-    heights = np.maximum(_smooth(heights, 1.5), 0.2 * radius) * _taper(z, 8.0)
-    surface = Surface(
-        kind=TUBE,
-        heights=np.ascontiguousarray(heights, np.float32),
+    heights = np.maximum(_smooth(heights, 2.5), 0.34 * radius) * _taper(z, 8.0)
+    surface = make_surface(
+        TUBE,
+        heights,
         centre=centreline(random, z, random.uniform(0.1, 0.6), (40.0, 120.0)),
         first=(float(z[0]), 0.0),
         step=(0.2, 4.0 / _COLUMNS),

@@ -7,6 +7,7 @@ the free space where the camera moves, so that one kernel traces both.
 
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
@@ -14,6 +15,7 @@ Array = npt.NDArray[np.float32]
 
 TUBE = 0
 FIELD = 1
+BLOCK = 8
 
 
 class Surface(NamedTuple):
@@ -28,8 +30,14 @@ class Surface(NamedTuple):
     """Row and column coordinate of the first sample: z (and 0) of a tube, y and x of a field."""
     step: tuple[float, float]
     """Distance of two samples. Columns of a tube count quarters of a turn: 4 / columns."""
+    density: tuple[float, float]
+    """Samples per unit, 1 / step."""
     stride_mm: float
-    """Longest step of the ray marcher: less than the thinnest fold."""
+    """Longest step of the ray marcher near the wall: less than the thinnest fold."""
+    core: Array
+    """Least height within ``leap_mm`` of each block of ``BLOCK`` x ``BLOCK`` samples; of a tube's whole ring."""
+    leap_mm: float
+    """Longest step of the ray marcher inside the core."""
     feature_mm: float
     """Size of the creases that are darkened."""
 
@@ -61,3 +69,39 @@ class Scene(NamedTuple):
     family: str
     surface: Surface
     tissue: Tissue
+
+
+def make_surface(
+    kind: int,
+    heights: Array,
+    *,
+    first: tuple[float, float],
+    step: tuple[float, float],
+    stride_mm: float,
+    feature_mm: float,
+    centre: Array | None = None,
+) -> Surface:
+    """A surface with the tables that its ray marcher needs; see ``Surface`` for the arguments."""
+    leap_mm = 4.0 * stride_mm
+    margin = int(np.ceil(leap_mm / step[0]))
+    if kind == TUBE:
+        least = heights.min(axis=1, keepdims=True)
+        window, stride = (2 * margin + 1, 1), (BLOCK, 1)
+    else:
+        least, window, stride = heights, (2 * margin + 1, 2 * margin + 1), (BLOCK, BLOCK)
+    least = cv2.erode(least, np.ones(window, np.uint8), borderType=cv2.BORDER_REPLICATE).reshape(least.shape)
+    for axis in range(2):
+        starts = np.arange(0, least.shape[axis], stride[axis])
+        least = np.minimum.reduceat(least, starts, axis=axis)
+    return Surface(
+        kind=kind,
+        heights=np.ascontiguousarray(heights, np.float32),
+        centre=np.zeros((2, 2), np.float32) if centre is None else centre,
+        first=first,
+        step=step,
+        density=(1.0 / step[0], 1.0 / step[1]),
+        stride_mm=stride_mm,
+        core=np.ascontiguousarray(least, np.float32),
+        leap_mm=leap_mm,
+        feature_mm=feature_mm,
+    )

@@ -56,11 +56,11 @@ def make_tissue(
         size_mm: Mean height and width of the surface map.
         wrap: Whether its columns close to a ring.
         vessel_step_mm: Resolution of the vessels.
-        grain: Size of blotches and relief against their usual size.
+        grain: Size of blotches, relief and vessels against their usual size.
     """
     area = size_mm[0] * size_mm[1] / 20_000.0
     trees = max(1, round(draw(random, material.vessels) * area)) if material.vessels[1] > 0 else 0
-    level = vessel_map(random, size_mm, vessel_step_mm, trees, wrap=wrap)
+    level = vessel_map(random, size_mm, vessel_step_mm, trees, wrap=wrap, width=grain)
     levels = [level]
     for _ in range(3):
         rows, columns = (max(2, n // 2) for n in levels[-1].shape)
