@@ -81,5 +81,5 @@ class EngineRunner:
             progress("estimating", 0, None)
             for number, frame in enumerate(run, 1):
                 writer.append(frame)
-                progress("estimating", number, None)
+                progress("estimating", number, run.frame_count)
             writer.close(run.meta())

@@ -35,6 +35,11 @@ class DepthOptions(BaseModel, frozen=True, extra="forbid"):
 class DepthRun(Protocol):
     """One clip on its way through an engine; iterate over it once."""
 
+    @property
+    def frame_count(self) -> int | None:
+        """Frames that the result will have, as far as the source says; known once iteration has begun."""
+        ...
+
     def __iter__(self) -> Iterator[FrameDepth]:
         """Finished frames in video order; memory does not grow with their number.
 
@@ -49,7 +54,7 @@ class DepthRun(Protocol):
         ...
 
     def close(self) -> None:
-        """Stop the work and release what it holds; safe to call twice."""
+        """Stop the work at its next checkpoint; safe from another thread, and to call twice."""
         ...
 
 

@@ -14,6 +14,7 @@ import typer
 from bathyscope.bundle import Bundle, shipped_bundle
 from bathyscope.engines import Engine
 from bathyscope.errors import BathyscopeError, SettingsError
+from bathyscope_serve.engine_settings import EngineSettings
 from bathyscope_serve.settings import ServiceSettings
 
 app = typer.Typer(add_completion=False)
@@ -58,7 +59,7 @@ def load_engine(settings: ServiceSettings) -> Engine:
     """
     from bathyscope_serve.engine import DepthEngine
 
-    return DepthEngine(Bundle.open(settings.bundle or shipped_bundle()))
+    return DepthEngine(Bundle.open(settings.bundle or shipped_bundle()), EngineSettings(threads=settings.threads))
 
 
 def bind(host: str, port: int) -> socket.socket:

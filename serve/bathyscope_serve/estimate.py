@@ -55,8 +55,8 @@ class Estimate:
     engine: Engine
     order: Order
     timeout_s: float
-    stop: threading.Event = field(default_factory=threading.Event)
-    """Set it to stop the work at the next frame."""
+    _stop: threading.Event = field(default_factory=threading.Event)
+    _run: DepthRun | None = None
     _created: float = field(default_factory=time.monotonic)
     _began: float = 0.0
 
@@ -70,9 +70,16 @@ class Estimate:
         self._began = time.monotonic()
         order = self.order
         with closing(self.engine.run(order.source, order.options, name=order.name)) as run:
+            self._run = run
             if order.form == "json":
                 return self._summarise(run)
             return self._write(run)
+
+    def cancel(self) -> None:
+        """Stop the work as soon as may be; from another thread. It then ends with an error that nobody reads."""
+        self._stop.set()
+        if self._run is not None:
+            self._run.close()
 
     def _write(self, run: DepthRun) -> Outcome:
         npz = self.order.folder / "result.npz"
@@ -110,7 +117,7 @@ class Estimate:
     def _stoppable(self, run: DepthRun) -> Iterator[FrameDepth]:
         frames = iter(run)
         count = 0
-        while not self.stop.is_set():
+        while not self._stop.is_set():
             frame = next(frames, None)
             if frame is None:
                 return

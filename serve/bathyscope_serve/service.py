@@ -11,7 +11,7 @@ from collections.abc import Awaitable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import structlog
 
@@ -103,13 +103,14 @@ class DepthService:
         job = self._pool.submit(estimate.run)
         work, watch = asyncio.wrap_future(job), asyncio.ensure_future(gone)
         try:
-            await asyncio.wait({work, watch}, return_when=asyncio.FIRST_COMPLETED)
+            ends: set[asyncio.Future[Any]] = {work, watch}
+            await asyncio.wait(ends, return_when=asyncio.FIRST_COMPLETED)
             if not work.done():
                 raise ClientGone
             outcome = work.result()
         finally:
             watch.cancel()
-            estimate.stop.set()
+            estimate.cancel()
             if not job.cancel():
                 await asyncio.gather(asyncio.wrap_future(job), return_exceptions=True)
         self._mean_work_s += 0.3 * (outcome.meta.timings_s["work"] - self._mean_work_s)

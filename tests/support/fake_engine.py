@@ -53,6 +53,7 @@ class FakeRun:
         self._engine, self._source, self._options, self._name = engine, source, options, name
         self.closed = False
         self.yielded = 0
+        self.frame_count: int | None = engine.frames
 
     def __iter__(self) -> Iterator[FrameDepth]:
         content = b""
