@@ -22,6 +22,7 @@ from pydantic import BaseModel, Field, PositiveFloat, PositiveInt, ValidationErr
 from bathyscope.errors import BundleError
 from bathyscope.external_data import external_locations
 from bathyscope.result import BundleId
+from bathyscope.zip_errors import ZIP_ERRORS
 
 BUNDLE_FORMAT = 1
 """The newest bundle format that this build reads."""
@@ -256,5 +257,5 @@ def _unpack(path: Path, folder: Path) -> None:
                     raise BundleError(f"{path}: member {member.filename!r} is not a plain file name")
                 with archive.open(member) as source, (folder / member.filename).open("xb") as target:
                     shutil.copyfileobj(source, target, 1 << 20)
-    except (zipfile.BadZipFile, EOFError, OSError, RuntimeError, NotImplementedError) as error:
+    except ZIP_ERRORS as error:
         raise BundleError(f"{path}: neither a bundle folder nor a readable .zip of one ({error})") from error

@@ -24,11 +24,15 @@ from pydantic import ValidationError
 from bathyscope.camera import Size
 from bathyscope.errors import GeometryError, ResultError
 from bathyscope.result import ARRAY_NAMES, RESULT_FORMAT, ClipDepth, FrameDepth, ResultMeta
+from bathyscope.zip_errors import ZIP_ERRORS
 
 MAPS = ("depth", "confidence", "valid")
 """The arrays that have a value for each pixel, and so decide the size of the file."""
 Precision = Literal["float32", "float16"]
 MAX_RESULT_BYTES = 1 << 40
+MAX_SMALL_BYTES = 1 << 28
+"""Longest of the arrays that have one value, or one matrix, a frame."""
+_KINDS = {"world_from_camera": "f", "intrinsics": "f", "timestamps_s": "f", "segment": "iu", "meta": "U"}
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -135,7 +139,7 @@ class NpzReader:
         self.path = Path(path)
         try:
             self._archive = zipfile.ZipFile(self.path)
-        except (OSError, zipfile.BadZipFile) as error:
+        except ZIP_ERRORS as error:
             raise ResultError(f"{self.path}: not a readable npz file ({error})") from error
         try:
             self._headers = {name: self._header(name) for name in MAPS}
@@ -165,9 +169,8 @@ class NpzReader:
         """The frames in order; only one is in memory at a time."""
         spools = {name: self._open(name) for name in MAPS}
         try:
-            for spool in spools.values():
-                npy.read_magic(spool)
-                npy.read_array_header_1_0(spool)
+            for name, spool in spools.items():
+                _read_header(spool, self.path.name, name)
             for t in range(len(self)):
                 yield self._frame(t, {name: self._next_map(name, spools[name]) for name in MAPS})
         finally:
@@ -192,7 +195,10 @@ class NpzReader:
 
     def _next_map(self, name: str, spool: IO[bytes]) -> Any:
         (_, h, w), dtype = self._headers[name]
-        data = spool.read(h * w * dtype.itemsize)
+        try:
+            data = spool.read(h * w * dtype.itemsize)
+        except ZIP_ERRORS as error:
+            raise ResultError(f"{self.path.name}: {name} is damaged ({error})") from error
         if len(data) != h * w * dtype.itemsize:
             raise ResultError(f"{self.path.name}: {name} ends early")
         return np.frombuffer(data, dtype).reshape(h, w)
@@ -202,6 +208,8 @@ class NpzReader:
             return self._archive.open(f"{name}.npy")
         except KeyError as error:
             raise ResultError(f"{self.path.name}: no array {name!r}; not a result of bathyscope") from error
+        except ZIP_ERRORS as error:
+            raise ResultError(f"{self.path.name}: {name} is damaged ({error})") from error
 
     def _header(self, name: str) -> tuple[tuple[int, int, int], np.dtype[Any]]:
         with self._open(name) as member:
@@ -214,13 +222,17 @@ class NpzReader:
         return (shape[0], shape[1], shape[2]), dtype
 
     def _small(self, name: str) -> Any:
+        """A whole array; its size is checked before it takes memory."""
         with self._open(name) as member:
-            info = self._archive.getinfo(f"{name}.npy")
-            if info.file_size > 1 << 28:
-                raise ResultError(f"{self.path.name}: {name} has {info.file_size} bytes, which no result needs")
+            shape, dtype = _read_header(member, self.path.name, name)
+        stored = self._archive.getinfo(f"{name}.npy").file_size
+        claimed = int(np.prod(shape, dtype=object)) * dtype.itemsize
+        if dtype.kind not in _KINDS[name] or claimed > min(stored, MAX_SMALL_BYTES):
+            raise ResultError(f"{self.path.name}: {name} is {dtype} {shape} in {stored} bytes, which no result has")
+        with self._open(name) as member:
             try:
                 return npy.read_array(member, allow_pickle=False)
-            except (ValueError, EOFError, zipfile.BadZipFile) as error:
+            except ZIP_ERRORS as error:
                 raise ResultError(f"{self.path.name}: {name} is damaged ({error})") from error
 
     def _check(self) -> None:
@@ -269,7 +281,7 @@ def _read_header(member: IO[bytes], file: str, name: str) -> tuple[tuple[int, ..
         if npy.read_magic(member) != (1, 0):
             raise ValueError("unknown npy version")
         shape, fortran, dtype = npy.read_array_header_1_0(member)
-    except (ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (TypeError, *ZIP_ERRORS) as error:
         raise ResultError(f"{file}: {name} is damaged ({error})") from error
     if fortran:
         raise ResultError(f"{file}: {name} is in Fortran order; results are in C order")

@@ -19,13 +19,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 
 from bathyscope.errors import ResultError
 from bathyscope.png import decode_grey, encode_grey
 from bathyscope.result import ClipDepth, FrameDepth, ResultMeta
 from bathyscope.result_files import NpzReader
 from bathyscope.tum import tum_lines
+from bathyscope.zip_errors import ZIP_ERRORS
 
 _LEVELS = 65535
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -77,7 +78,7 @@ def load_zip(path: Path | str) -> ClipDepth:
         with zipfile.ZipFile(path) as archive:
             index = ZipIndex.model_validate_json(_read(archive, "result.json", MAX_JSON_BYTES))
             frames = [_read_frame(archive, index, t) for t in range(len(index.frames))]
-    except (OSError, zipfile.BadZipFile, KeyError, ValidationError) as error:
+    except (KeyError, *ZIP_ERRORS) as error:
         raise ResultError(f"{path}: not a readable result zip ({error})") from error
     return ClipDepth.from_frames(frames, index.meta)
 
