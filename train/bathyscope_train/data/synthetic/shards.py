@@ -57,7 +57,7 @@ def read_clip(path: Path) -> SyntheticClip:
                 seed=int(file["seed"]),
                 domain=str(file["domain"]),
             )
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise DatasetError(f"{path}: not a rendered clip: {error}") from error
 
 
