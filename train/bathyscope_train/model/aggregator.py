@@ -8,8 +8,9 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bathyscope_train.model.blocks import Block
-from bathyscope_train.model.presets import NetworkPreset
+from bathyscope_train.model.presets import ConvStemSettings, NetworkPreset
 from bathyscope_train.model.rope import grid_positions, rope_tables
+from bathyscope_train.model.stem import ConvStem
 from bathyscope_train.model.vit import VisionTransformer
 
 _MEAN = (0.485, 0.456, 0.406)
@@ -49,8 +50,8 @@ class Aggregator(nn.Module):
     def special_tokens(self, clips: int, frames: int) -> Float[Tensor, "b t s c"]:
         """Camera token and registers of every frame."""
         slots = torch.cat((self.camera_token, self.register_token), dim=2)
-        first, others = slots[:, :1], slots[:, 1:]
-        return torch.cat((first, others.expand(-1, frames - 1, -1, -1)), dim=1).expand(clips, -1, -1, -1)
+        slot = (torch.arange(frames, device=slots.device) > 0).long()
+        return slots[:, slot].expand(clips, -1, -1, -1)
 
     def forward(self, images: Float[Tensor, "b t 3 h w"]) -> Aggregation:
         """Tokens of the wanted layers for clips of images in [0, 1] whose sides are multiples of the patch size."""
@@ -89,6 +90,8 @@ def build_stem(preset: NetworkPreset) -> nn.Module:
     that the heads may read.
     """
     stem, settings = preset.stem, preset.aggregator
+    if isinstance(stem, ConvStemSettings):
+        return ConvStem(settings.width, channels=stem.channels, patch_size=preset.patch_size)
     return VisionTransformer(
         width=settings.width,
         depth=stem.depth,

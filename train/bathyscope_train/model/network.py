@@ -17,7 +17,14 @@ from bathyscope_train.model.aggregator import Aggregator
 from bathyscope_train.model.camera_head import CameraHead
 from bathyscope_train.model.dense_head import DepthHead, activate_depth
 from bathyscope_train.model.gaussian_head import GaussianHead
-from bathyscope_train.model.presets import NetworkPreset
+from bathyscope_train.model.light_dense_head import LightDepthHead, LightGaussianHead
+from bathyscope_train.model.matching_camera_head import MatchingCameraHead
+from bathyscope_train.model.presets import (
+    ConvStemSettings,
+    LightHeadSettings,
+    MatchingCameraSettings,
+    NetworkPreset,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,13 +103,31 @@ class Network(nn.Module):
         frames = images.flatten(0, 1)
         with _float32(images.device):
             taps = [tokens.flatten(0, 1).float() for tokens in features.taps]
-            depth, confidence = activate_depth(self.depth_head(taps, frames))
-            raw = None if self.gaussian_param_head is None else self.gaussian_param_head(taps, frames)
+            maps = [each.flatten(0, 1).float() for each in features.stem_maps]
+            depth, confidence = activate_depth(self._raw_depth(taps, frames, maps))
+            raw = self._raw_gaussians(taps, frames, maps, depth)
         return DenseMaps(
             depth=depth.unflatten(0, (b, t)),
             confidence=confidence.unflatten(0, (b, t)),
             gaussians=None if raw is None else raw.unflatten(0, (b, t)),
         )
+
+    def _raw_depth(self, taps: list[Tensor], frames: Tensor, stem_maps: list[Tensor]) -> Tensor:
+        if isinstance(self.depth_head, LightDepthHead):
+            light: Tensor = self.depth_head(taps, frames, stem_maps)
+            return light
+        raw: Tensor = self.depth_head(taps, frames)
+        return raw
+
+    def _raw_gaussians(
+        self, taps: list[Tensor], frames: Tensor, stem_maps: list[Tensor], depth: Tensor
+    ) -> Tensor | None:
+        if self.gaussian_param_head is None:
+            return None
+        if isinstance(self.gaussian_param_head, LightGaussianHead):
+            return self.gaussian_param_head.predict(taps, frames, stem_maps, depth)
+        raw: Tensor = self.gaussian_param_head(taps, frames)
+        return raw
 
     def cameras(self, features: Features, depth: Float[Tensor, "b t h w"]) -> Float[Tensor, "b t 9"]:
         """Final pose encoding of every frame."""
@@ -110,9 +135,13 @@ class Network(nn.Module):
 
     def camera_iterations(self, features: Features, depth: Float[Tensor, "b t h w"]) -> Float[Tensor, "i b t 9"]:
         """Pose encodings after each iteration; the iterative head makes no use of ``depth``."""
-        del depth
         with _float32(features.camera.device):
-            encodings: Tensor = self.camera_head(features.camera.float())
+            camera = features.camera.float()
+            if isinstance(self.camera_head, MatchingCameraHead):
+                maps = [each.float() for each in features.stem_maps]
+                solved: Tensor = self.camera_head(camera, features.taps[-1].float(), maps, depth.float())
+                return solved
+            encodings: Tensor = self.camera_head(camera)
         return encodings
 
     def forward(self, images: Float[Tensor, "b t 3 h w"]) -> Prediction:
@@ -124,9 +153,17 @@ class Network(nn.Module):
 
 def build_camera_head(preset: NetworkPreset) -> nn.Module:
     """The camera head that ``preset.camera`` asks for."""
-    settings = preset.camera
+    settings, width = preset.camera, 2 * preset.aggregator.width
+    if isinstance(settings, MatchingCameraSettings):
+        return MatchingCameraHead(
+            width,
+            stem_channels=2 * _stem_channels(preset),
+            patch_size=preset.patch_size,
+            rounds=settings.rounds,
+            iterations=settings.iterations,
+        )
     return CameraHead(
-        width=2 * preset.aggregator.width,
+        width=width,
         depth=settings.depth,
         heads=settings.heads,
         iterations=settings.iterations,
@@ -137,19 +174,44 @@ def build_camera_head(preset: NetworkPreset) -> nn.Module:
 
 def build_depth_head(preset: NetworkPreset) -> nn.Module:
     """The depth head that ``preset.depth`` asks for."""
-    return DepthHead(2 * preset.aggregator.width, preset.depth, patch_size=preset.patch_size)
+    settings, width = preset.depth, 2 * preset.aggregator.width
+    if isinstance(settings, LightHeadSettings):
+        return LightDepthHead(
+            width,
+            len(preset.aggregator.taps),
+            settings,
+            stem_channels=_stem_channels(preset),
+            patch_size=preset.patch_size,
+        )
+    return DepthHead(width, settings, patch_size=preset.patch_size)
 
 
 def build_gaussian_head(preset: NetworkPreset) -> nn.Module | None:
     """The Gaussian head that ``preset.gaussians`` asks for, if any; it ends in a fusion confidence channel."""
-    if preset.gaussians is None:
+    settings, width, outputs = preset.gaussians, 2 * preset.aggregator.width, preset.gaussian_channels + 1
+    if settings is None:
         return None
+    if isinstance(settings, LightHeadSettings):
+        return LightGaussianHead(
+            width,
+            len(preset.aggregator.taps),
+            settings,
+            stem_channels=_stem_channels(preset),
+            patch_size=preset.patch_size,
+            outputs=outputs,
+        )
     return GaussianHead(
-        2 * preset.aggregator.width,
-        preset.gaussians,
-        outputs=preset.gaussian_channels + 1,
+        width,
+        settings,
+        outputs=outputs,
         patch_size=preset.patch_size,
     )
+
+
+def _stem_channels(preset: NetworkPreset) -> int:
+    """Channels of the stem's half-size map; the preset has checked that there is one."""
+    assert isinstance(preset.stem, ConvStemSettings)
+    return preset.stem.channels
 
 
 @contextmanager

@@ -5,29 +5,41 @@ comes in several kinds has a ``kind`` field; the factories beside the parts read
 """
 
 from types import MappingProxyType
-from typing import Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from bathyscope.errors import SettingsError
+
+Repeats = Annotated[int, Field(ge=1, le=128)]
+"""How often a part is repeated; bounded, because a preset may come out of somebody else's checkpoint."""
 
 
 class VitSettings(BaseModel, frozen=True, extra="forbid"):
     """DINOv2 vision transformer as image encoder; its width is the aggregator's."""
 
     kind: Literal["vit"] = "vit"
-    depth: PositiveInt = 24
+    depth: Repeats = 24
     heads: PositiveInt = 16
     registers: NonNegativeInt = 4
     grid: PositiveInt = Field(default=37, description="Side of the learnt position grid, in patches (518 / 14).")
     layer_scale: PositiveFloat = 1.0
 
 
+class ConvStemSettings(BaseModel, frozen=True, extra="forbid"):
+    """Small convolutional pyramid as image encoder; keeps its maps for the heads."""
+
+    kind: Literal["conv"] = "conv"
+    channels: PositiveInt = Field(
+        default=32, description="Of the half-size map; the quarter-size map has twice as many."
+    )
+
+
 class AggregatorSettings(BaseModel, frozen=True, extra="forbid"):
     """Alternating attention within each frame and across the clip."""
 
     width: PositiveInt = 1024
-    depth: PositiveInt = Field(default=24, description="Pairs of a frame block and a global block.")
+    depth: Repeats = Field(default=24, description="Pairs of a frame block and a global block.")
     heads: PositiveInt = 16
     registers: NonNegativeInt = 4
     mlp_ratio: PositiveInt = 4
@@ -48,10 +60,18 @@ class IterativeCameraSettings(BaseModel, frozen=True, extra="forbid"):
     """Camera head that refines a pose encoding from the camera tokens alone."""
 
     kind: Literal["iterative"] = "iterative"
-    depth: PositiveInt = 4
+    depth: Repeats = 4
     heads: PositiveInt = 16
-    iterations: PositiveInt = 4
+    iterations: Repeats = 4
     layer_scale: PositiveFloat = 0.01
+
+
+class MatchingCameraSettings(BaseModel, frozen=True, extra="forbid"):
+    """Camera head that solves for motion from learnt matches and the predicted depth."""
+
+    kind: Literal["matching"] = "matching"
+    rounds: Repeats = 2
+    iterations: Repeats = Field(default=3, description="Solver iterations a round.")
 
 
 class DptSettings(BaseModel, frozen=True, extra="forbid"):
@@ -61,6 +81,15 @@ class DptSettings(BaseModel, frozen=True, extra="forbid"):
     features: PositiveInt = Field(default=256, multiple_of=8)
     channels: tuple[PositiveInt, PositiveInt, PositiveInt, PositiveInt] = (256, 512, 1024, 1024)
     hidden: PositiveInt = Field(default=32, description="Width between the last two convolutions.")
+
+
+class LightHeadSettings(BaseModel, frozen=True, extra="forbid"):
+    """Small dense head that leans on the maps of a convolutional stem."""
+
+    kind: Literal["light"] = "light"
+    coarse: PositiveInt = Field(default=64, multiple_of=4, description="Channels at a quarter of the size.")
+    fine: PositiveInt = Field(default=16, description="Channels at full size.")
+    blocks: Repeats = Field(default=2, description="Residual convolutions a level.")
 
 
 class SceneSettings(BaseModel, frozen=True, extra="forbid"):
@@ -78,11 +107,13 @@ class NetworkPreset(BaseModel, frozen=True, extra="forbid"):
 
     name: str
     patch_size: PositiveInt = 14
-    stem: VitSettings = VitSettings()
+    stem: Annotated[VitSettings | ConvStemSettings, Field(discriminator="kind")] = VitSettings()
     aggregator: AggregatorSettings = AggregatorSettings()
-    camera: IterativeCameraSettings = IterativeCameraSettings()
-    depth: DptSettings = DptSettings()
-    gaussians: DptSettings | None = DptSettings(hidden=128)
+    camera: Annotated[IterativeCameraSettings | MatchingCameraSettings, Field(discriminator="kind")] = (
+        IterativeCameraSettings()
+    )
+    depth: Annotated[DptSettings | LightHeadSettings, Field(discriminator="kind")] = DptSettings()
+    gaussians: Annotated[DptSettings | LightHeadSettings, Field(discriminator="kind")] | None = DptSettings(hidden=128)
     harmonic_degree: int = Field(default=4, ge=0, le=4, description="Degree L of the spherical harmonics.")
     scene: SceneSettings = SceneSettings()
 
@@ -90,6 +121,14 @@ class NetworkPreset(BaseModel, frozen=True, extra="forbid"):
     def gaussian_channels(self) -> int:
         """Raw channels of a Gaussian without the fusion confidence: opacity, 3 scales, 4 rotation, 3 (L+1)^2 colour."""
         return 8 + 3 * (self.harmonic_degree + 1) ** 2
+
+    @model_validator(mode="after")
+    def _parts_that_read_the_stem_have_one(self) -> Self:
+        light = [self.camera.kind == "matching", self.depth.kind == "light"]
+        light.append(self.gaussians is not None and self.gaussians.kind == "light")
+        if any(light) and self.stem.kind != "conv":
+            raise ValueError(f"light heads and the matching camera head need a conv stem, got {self.stem.kind!r}")
+        return self
 
     @model_validator(mode="after")
     def _dpt_reads_four_layers(self) -> Self:
@@ -100,8 +139,19 @@ class NetworkPreset(BaseModel, frozen=True, extra="forbid"):
 
 _ANYSPLAT_SCENE = SceneSettings(pixel_center=0.0, focal_epsilon=1e-3, activation="anysplat", voxel_size=0.002)
 
+_TINY = NetworkPreset(
+    name="tiny",
+    stem=ConvStemSettings(),
+    aggregator=AggregatorSettings(width=192, depth=3, heads=3, registers=1, layer_scale=1.0, taps=(0, 1, 2)),
+    camera=MatchingCameraSettings(),
+    depth=LightHeadSettings(),
+    gaussians=LightHeadSettings(coarse=32, fine=8, blocks=1),
+    harmonic_degree=0,
+)
+
 PRESETS = MappingProxyType(
     {
+        "tiny": _TINY,
         "anysplat": NetworkPreset(name="anysplat", scene=_ANYSPLAT_SCENE),
         "vggt": NetworkPreset(
             name="vggt", gaussians=None, scene=SceneSettings(pixel_center=0.0, activation="anysplat")

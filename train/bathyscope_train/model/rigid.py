@@ -1,0 +1,90 @@
+"""Rigid motions as rotation matrices and translations: exponential, logarithm, composition, adjoint.
+
+A motion is a pair (rotation (..., 3, 3), translation (..., 3)) that maps ``x`` to ``R x + t``. Everything
+here is made of plain products, so that it exports as standard graph nodes at any batch shape.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_EPSILON = 1e-8
+
+
+def cross_matrix(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Matrix that takes the cross product with ``vector`` from the left."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
+    return rows.reshape(*rows.shape[:-1], 3, 3)
+
+
+def rotation_exponential(angles: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation about ``angles`` by its length, in radians (Rodrigues).
+
+    The squared length gets 1e-8 added, which keeps the gradient finite at zero and costs less than 1e-8
+    in the result.
+    """
+    theta = (angles.square().sum(-1, keepdim=True) + _EPSILON).sqrt()[..., None]
+    cross = cross_matrix(angles)
+    identity = torch.eye(3, dtype=angles.dtype, device=angles.device)
+    return identity + torch.sin(theta) / theta * cross + (1 - torch.cos(theta)) / theta.square() * (cross @ cross)
+
+
+def rotation_logarithm(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Rotation vector of ``rotation``; accurate below about 3 radians, which differences of cameras are."""
+    vector = antisymmetric_part(rotation)
+    sine = (vector.square().sum(-1, keepdim=True) + _EPSILON).sqrt()
+    cosine = (trace(rotation)[..., None] - 1) / 2
+    return vector * torch.atan2(sine, cosine) / sine
+
+
+def antisymmetric_part(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """The vector of the antisymmetric half of a matrix: axis times sine of the angle for a rotation."""
+    return 0.5 * torch.stack(
+        [
+            rotation[..., 2, 1] - rotation[..., 1, 2],
+            rotation[..., 0, 2] - rotation[..., 2, 0],
+            rotation[..., 1, 0] - rotation[..., 0, 1],
+        ],
+        -1,
+    )
+
+
+def trace(matrix: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+    """Sum of the diagonal."""
+    return matrix[..., 0, 0] + matrix[..., 1, 1] + matrix[..., 2, 2]
+
+
+def rotate(rotation: Float[Tensor, "*b 3 3"], vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
+    """Product of a matrix and a vector."""
+    return (rotation @ vector[..., None])[..., 0]
+
+
+def compose(
+    outer: tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]],
+    inner: tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]],
+) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]]:
+    """The motion ``inner``, then ``outer``."""
+    return outer[0] @ inner[0], rotate(outer[0], inner[1]) + outer[1]
+
+
+def adjoint(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6 6"]:
+    """Carries a small motion (translation, rotation vector) from before a motion to after it.
+
+    ``T exp(d) = exp(adjoint(T) d) T`` with ``exp(d)`` the small motion with translation ``d[:3]`` and
+    rotation vector ``d[3:]``, to first order.
+    """
+    top = torch.cat([rotation, cross_matrix(translation) @ rotation], -1)
+    bottom = torch.cat([torch.zeros_like(rotation), rotation], -1)
+    return torch.cat([top, bottom], -2)
+
+
+def relative_motion(
+    world_from_camera: Float[Tensor, "*b t 4 4"], source: Tensor, target: Tensor
+) -> tuple[Float[Tensor, "*b e 3 3"], Float[Tensor, "*b e 3"]]:
+    """Motion that maps points of the ``source`` cameras into the ``target`` cameras, for e pairs of frames."""
+    first, second = world_from_camera[..., source, :, :], world_from_camera[..., target, :, :]
+    second_rotation = second[..., :3, :3].transpose(-1, -2)
+    translation = rotate(second_rotation, first[..., :3, 3] - second[..., :3, 3])
+    return second_rotation @ first[..., :3, :3], translation

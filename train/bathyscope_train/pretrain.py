@@ -1,0 +1,234 @@
+"""Supervised pre-training on rendered clips: depth, cameras and Gaussians from nothing."""
+
+import json
+import logging
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from bathyscope.errors import SettingsError
+from bathyscope_train.config import PretrainSettings
+from bathyscope_train.data.truth_clips import read_truth_clips
+from bathyscope_train.data.windows import Batch, TruthClip, sample_window, stack
+from bathyscope_train.losses.supervised import supervised_objective
+from bathyscope_train.model.matching_camera_head import MatchingCameraHead
+from bathyscope_train.model.network import Network
+from bathyscope_train.model.presets import get_preset
+from bathyscope_train.model.trajectory import GAPS
+from bathyscope_train.schedule import ema_decay, learning_rate_factor, source_shares
+from bathyscope_train.training_state import read_state, read_weights, write_state, write_weights
+from bathyscope_train.validation import Validation, validate, write_grid
+from bathyscope_train.workers import average, launch, share_gradients
+
+LOG_STEPS = 10
+WEIGHTS_FILE = "model.safetensors"
+METRICS_FILE = "metrics.jsonl"
+
+_log = logging.getLogger(__name__)
+
+
+def pretrain(settings: PretrainSettings) -> Path:
+    """Train, or go on with the run in ``settings.out``; returns the path of the weights (their running average).
+
+    The folder gets ``model.safetensors``, ``state.pt`` (to go on), ``metrics.jsonl``, ``settings.json`` and, at every
+    validation, ``validation.png``.
+
+    Raises:
+        SettingsError: If the preset cannot be trained this way.
+        DatasetError: If a folder holds no clips.
+    """
+    settings.out.mkdir(parents=True, exist_ok=True)
+    (settings.out / "settings.json").write_text(settings.model_dump_json(indent=2), encoding="utf-8")
+    launch(partial(_work, settings), settings.workers)
+    return settings.out / WEIGHTS_FILE
+
+
+def _work(settings: PretrainSettings, rank: int) -> None:
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
+    torch.set_num_threads(settings.threads)
+    _Run(settings, rank).train()
+
+
+class _Run:
+    """One worker's side of a training run."""
+
+    def __init__(self, settings: PretrainSettings, rank: int) -> None:
+        self.settings, self.rank = settings, rank
+        self.network = initial_network(settings)
+        self.average = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
+        self.parameters = list(self.network.parameters())
+        self.optimizer = torch.optim.AdamW(parameter_groups(self.network, settings), betas=(0.9, 0.98))
+        self.position = read_state(settings.out, self.network, self.average, self.optimizer)
+        self.sources: dict[Path, list[TruthClip]] = {}
+        self.held_out = [read_truth_clips(path, limit=settings.validation_clips) for path in settings.validation]
+        self.started = time.monotonic() - self.position.elapsed_s
+        self.recent: list[Tensor] = []
+
+    def train(self) -> None:
+        """Take steps until the budget is used up."""
+        validated = saved = time.monotonic()
+        progress = self.progress()
+        while progress < 1:
+            progress = self.step(progress)
+            now = time.monotonic()
+            if self.rank == 0 and now - saved > 60 * self.settings.checkpoint_minutes:
+                self.save()
+                saved = now
+            if self.rank == 0 and self.held_out and now - validated > 60 * self.settings.validate_minutes:
+                self.validate()
+                validated = time.monotonic()
+        if self.rank == 0:
+            self.save()
+            if self.held_out:
+                self.validate()
+
+    def progress(self) -> float:
+        """Share of the budget that is used up."""
+        if self.settings.steps is not None:
+            return self.position.step / self.settings.steps
+        return (time.monotonic() - self.started) / (60 * self.settings.minutes)
+
+    def step(self, progress: float) -> float:
+        """One optimiser step; returns the new progress, the same in all workers."""
+        settings, step = self.settings, self.position.step
+        random = np.random.default_rng([settings.seed, step, self.rank])
+        batch = self.draw_batch(progress, random)
+        source, target = draw_pairs(settings.frames, settings.pairs, random)
+        true_focal = step < settings.true_focal_steps or random.random() < 0.5
+        self.network.train()
+        self.optimizer.zero_grad(set_to_none=True)
+        objective = supervised_objective(
+            self.network,
+            batch,
+            source,
+            target,
+            settings.loss,
+            true_focal=bool(true_focal),
+            autocast=use_bfloat16(settings.precision),
+        )
+        objective.total.backward()
+        self.position.step += 1
+        progress = share_gradients(self.parameters, self.progress())
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters, settings.clip_norm)
+        factor = learning_rate_factor(step, progress, warmup_steps=settings.warmup_steps)
+        for group in self.optimizer.param_groups:
+            group["lr"] = settings.peak_lr * factor
+        if bool(norm.isfinite()):
+            self.optimizer.step()
+        else:
+            _log.warning("step %d: gradient is not finite; step left out", step)
+        self.update_average(step)
+        self.report(objective.terms, norm, factor, progress)
+        return progress
+
+    def draw_batch(self, progress: float, random: np.random.Generator) -> Batch:
+        """This worker's share of a batch; a folder of clips is read when it is first in use."""
+        shares = source_shares(self.settings.data, progress)
+        for source, share in zip(self.settings.data, shares, strict=True):
+            if share > 0 and source.folder not in self.sources:
+                self.sources[source.folder] = read_truth_clips(source.folder)
+        windows = []
+        for _ in range(self.settings.batch // self.settings.workers):
+            clips = self.sources[self.settings.data[int(random.choice(len(shares), p=shares))].folder]
+            clip = clips[int(random.integers(len(clips)))]
+            windows.append(sample_window(clip, random, frames=self.settings.frames))
+        return stack(windows)
+
+    def update_average(self, step: int) -> None:
+        """Move the running average of the weights."""
+        decay = ema_decay(step, self.settings.ema_decay)
+        for name, value in self.network.state_dict().items():
+            self.average[name].lerp_(value, 1 - decay)
+
+    def report(self, terms: dict[str, Tensor], norm: Tensor, factor: float, progress: float) -> None:
+        """Every few steps, a line with the means of the terms since the last one."""
+        self.recent.append(torch.stack([*(term.detach() for term in terms.values()), norm.detach()]))
+        if len(self.recent) < LOG_STEPS:
+            return
+        means = average(torch.stack(self.recent).mean(0))
+        self.recent.clear()
+        if self.rank == 0:
+            names = [*terms, "gradient_norm"]
+            values = {name: round(float(value), 5) for name, value in zip(names, means, strict=True)}
+            self.write({"progress": round(progress, 4), "rate": factor, **values})
+
+    def validate(self) -> None:
+        """Measure the running average on the held-out clips."""
+        network = Network(self.network.preset)
+        network.load_state_dict(self.average)
+        examples = []
+        for folder, clips in zip(self.settings.validation, self.held_out, strict=True):
+            result, pictures = validate(network, clips, frames=self.settings.frames)
+            self.write({"validation": folder.name, **json.loads(result.as_json())})
+            _log.info("step %d, %s: %s", self.position.step, folder.name, summary(result))
+            examples += pictures[:6]
+        write_grid(self.settings.out / "validation.png", examples)
+
+    def save(self) -> None:
+        """Write weights and state."""
+        self.position.elapsed_s = time.monotonic() - self.started
+        provenance = {"step": self.position.step, "settings": json.loads(self.settings.model_dump_json())}
+        write_weights(self.settings.out / WEIGHTS_FILE, self.network, self.average, provenance)
+        write_state(self.settings.out, self.network, self.average, self.optimizer, self.position)
+
+    def write(self, values: dict[str, Any]) -> None:
+        """Append a line to the metrics."""
+        line = {"step": self.position.step, "elapsed_s": round(time.monotonic() - self.started, 1), **values}
+        with (self.settings.out / METRICS_FILE).open("a", encoding="utf-8") as file:
+            file.write(json.dumps(line) + "\n")
+
+
+def initial_network(settings: PretrainSettings) -> Network:
+    """A fresh network, the same for the same seed, or the one in ``settings.initial``.
+
+    Raises:
+        SettingsError: If the network's camera head cannot be supervised by matches.
+    """
+    torch.manual_seed(settings.seed)
+    network = read_weights(settings.initial) if settings.initial else Network(get_preset(settings.preset))
+    if not isinstance(network.camera_head, MatchingCameraHead):
+        raise SettingsError(
+            f"preset {network.preset.name!r} has no matching camera head; pre-training needs one, as in 'tiny'"
+        )
+    return network
+
+
+def parameter_groups(network: Network, settings: PretrainSettings) -> list[dict[str, Any]]:
+    """Weight decay for matrices and kernels; none for biases, norms and tokens."""
+    decayed = [p for name, p in network.named_parameters() if p.ndim >= 2 and "token" not in name]
+    others = [p for name, p in network.named_parameters() if p.ndim < 2 or "token" in name]
+    return [
+        {"params": decayed, "weight_decay": settings.weight_decay, "lr": settings.peak_lr},
+        {"params": others, "weight_decay": 0.0, "lr": settings.peak_lr},
+    ]
+
+
+def draw_pairs(frames: int, count: int, random: np.random.Generator) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+    """Some of the pairs whose motions the trajectory uses, without repetition."""
+    every = [(k - gap, k) for gap in GAPS for k in range(gap, frames)]
+    chosen = random.permutation(len(every))[:count]
+    pairs = torch.tensor([every[int(index)] for index in chosen])
+    return pairs[:, 0], pairs[:, 1]
+
+
+def use_bfloat16(precision: str) -> bool:
+    """Whether the transformer runs in bfloat16; ``auto`` says so on a CPU with matrix units (AMX) only.
+
+    Without them bfloat16 is many times slower than float32.
+    """
+    return precision == "bfloat16" or (precision == "auto" and torch.cpu._is_amx_tile_supported())
+
+
+def summary(result: Validation) -> str:
+    """One line for a person."""
+    return (
+        f"AbsRel {result.abs_rel:.3f} (constant {result.constant:.3f}, best map {result.best_map:.3f}), "
+        f"d1 {result.delta1:.3f}, rotation {result.rotation_deg:.2f} of {result.rotation_true_deg:.2f} deg, "
+        f"direction {result.direction_cosine:.3f}, focal {result.focal_ratio:.2f}"
+    )

@@ -1,0 +1,80 @@
+"""Several processes that train one network: each takes a share of the batch, gradients are averaged.
+
+On a shared CPU two processes of one thread beat one process of two: they meet once a step, not at every
+operation.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from tempfile import mkdtemp
+
+import torch
+import torch.distributed as dist
+from torch import Tensor, nn
+
+from bathyscope.errors import SettingsError
+
+
+def launch(work: Callable[[int], None], workers: int) -> None:
+    """Run ``work(rank)`` in ``workers`` processes that can talk to each other.
+
+    One worker runs in this process. Under ``torchrun``, which starts the processes itself, this one is the worker
+    that the environment says it is.
+
+    Raises:
+        SettingsError: If ``torchrun`` started another number of processes.
+    """
+    if "RANK" in os.environ:
+        started = int(os.environ["WORLD_SIZE"])
+        if started != workers:
+            raise SettingsError(f"settings ask for {workers} workers, but {started} processes were started")
+        _work("env://", int(os.environ["RANK"]), workers, work)
+    elif workers == 1:
+        work(0)
+    else:
+        from torch.multiprocessing.spawn import spawn
+
+        meeting = Path(mkdtemp(prefix="bathyscope-train-")) / "meeting"
+        spawn(_join, args=(meeting.as_uri(), workers, work), nprocs=workers)
+
+
+def share_gradients(parameters: Sequence[nn.Parameter], progress: float) -> float:
+    """Average the gradients over all workers, in place; returns the progress of worker 0, for all to follow.
+
+    A parameter without a gradient counts as zero, so that all workers hold the same shapes.
+    """
+    if not dist.is_initialized():
+        return progress
+    count = dist.get_world_size()
+    flat = [p.grad.flatten() if p.grad is not None else torch.zeros_like(p).flatten() for p in parameters]
+    own = torch.tensor([progress if dist.get_rank() == 0 else 0.0])
+    joined = torch.cat([*flat, own])
+    dist.all_reduce(joined)
+    start = 0
+    for parameter in parameters:
+        part = joined[start : start + parameter.numel()] / count
+        parameter.grad = part.reshape(parameter.shape)
+        start += parameter.numel()
+    return float(joined[-1])
+
+
+def average(values: Tensor) -> Tensor:
+    """Mean over all workers."""
+    if dist.is_initialized():
+        values = values.clone()
+        dist.all_reduce(values)
+        values /= dist.get_world_size()
+    return values
+
+
+def _join(rank: int, meeting: str, workers: int, work: Callable[[int], None]) -> None:
+    _work(meeting, rank, workers, work)
+
+
+def _work(meeting: str, rank: int, workers: int, work: Callable[[int], None]) -> None:
+    dist.init_process_group("gloo", init_method=meeting, rank=rank, world_size=workers)
+    try:
+        work(rank)
+    finally:
+        dist.destroy_process_group()
