@@ -26,7 +26,7 @@ class DecodeLimits(BaseModel, frozen=True, extra="forbid"):
     file_bytes: PositiveInt = Field(default=16 << 30, description="Size of the file itself.")
     memory_bytes: PositiveInt = Field(default=2 << 30, description="Address space of the decoding process.")
     cpu_s: PositiveInt = Field(default=1800, description="CPU time of the decoding process.")
-    wait_s: PositiveFloat = Field(default=30.0, description="Longest wait for the next frame.")
+    wait_s: PositiveFloat = Field(default=60.0, description="Longest wait for the next frame.")
 
     def pixel_budget(self, file_bytes: int) -> int:
         """Pixels that a file of this size may decode to."""

@@ -80,7 +80,7 @@ class ImageReader:
                 )
             self.tally.decoded += 1
             if self.tally.decoded * image.shape[0] * image.shape[1] > self._limits.pixel_budget(self._bytes):
-                raise ClipError(f"{self._name}: {self._bytes} bytes decode to too many pixels")
+                raise ClipError(f"{self._name}: {self._bytes} bytes decode to too many pixels; cut it up")
             yield Decoded(number / IMAGE_RATE, image)
 
     def survey(self) -> Iterator[NDArray[np.uint8]]:
@@ -96,6 +96,9 @@ class ImageReader:
         codec = next((codec for magic, codec in _CODECS.items() if data.startswith(magic)), None)
         if codec is None:
             return None
+        size = declared_size(data)
+        if size is not None:
+            check_size(f"{self._name}: {name}", size, self._limits)
         context = cast(VideoCodecContext, VideoCodecContext.create(codec, "r"))
         context.thread_count = 1
         context.options = {"max_pixels": str(2 * self._limits.frame_pixels)}
@@ -116,6 +119,21 @@ def natural_key(name: str) -> list[tuple[int, int, str]]:
     """Sort key in which numbers count as numbers: ``f2`` before ``f10``."""
     parts = re.split(r"(\d{1,18})", name)
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
+
+
+def declared_size(data: bytes) -> tuple[int, int] | None:
+    """(height, width) from the header of a PNG or JPEG; ``None`` if it has none that can be read."""
+    if data.startswith(b"\x89PNG"):
+        return (int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")) if len(data) >= 24 else None
+    place = 2
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker, length = data[place + 1], int.from_bytes(data[place + 2 : place + 4], "big")
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # a start of frame
+            return int.from_bytes(data[place + 5 : place + 7], "big"), int.from_bytes(
+                data[place + 7 : place + 9], "big"
+            )
+        place += 2 + length
+    return None
 
 
 def open_folder(folder: Path, name: str, limits: DecodeLimits) -> ImageReader:

@@ -87,6 +87,9 @@ class VideoReader:
             self.frame_count: int | None = stream.frames or None
             self._interval_s = float(1 / stream.average_rate) if stream.average_rate else 1 / 25
             self._declared_s = _declared_seconds(container, stream)
+            self._counts_packets = container.format.name.startswith("mov")
+            # where only the container has a duration, another stream may be what lasts so long
+            self._duration_is_ours = stream.duration is not None or len(container.streams) == 1
             self._check_declared(stream)
 
     def frames(self) -> Iterator[Decoded]:
@@ -182,9 +185,9 @@ class VideoReader:
 
     def _check_ending(self, last_s: float | None) -> None:
         """A file cut short is told by its packets, or, where the container does not count them, by its duration."""
-        if last_s is None:
+        if last_s is None or self._declared_s is None or not self._duration_is_ours:
             return
-        if self._declared_s is not None and last_s + 2 * self._interval_s < 0.95 * self._declared_s - 0.5:
+        if last_s + 2 * self._interval_s < 0.98 * self._declared_s - 0.25:
             self.tally.stop_early(f"the video ends at {last_s:.2f} s of the {self._declared_s:.2f} s it declares")
 
     def _time(self, frame: VideoFrame, previous_s: float | None) -> float:
@@ -208,7 +211,7 @@ class VideoReader:
                     yield from self._frames_of(packet, count)
             except av.FFmpegError as error:
                 count.stop_early(f"reading stopped after {count.decoded} frames: {_reason(error)}")
-            if stream.frames > packets:
+            if self._counts_packets and stream.frames > packets:
                 count.stop_early(f"the file declares {stream.frames} frames and holds {packets}; it was cut short")
 
     def _frames_of(self, packet: Any, count: Tally) -> Iterator[VideoFrame]:
