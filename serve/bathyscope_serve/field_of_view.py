@@ -76,7 +76,7 @@ def find_field_of_view(brightest: NDArray[np.uint8]) -> FieldOfView:
     outside = 1 - inside.mean()
     if _SMALLEST_OUTSIDE < outside < 1 - _SMALLEST_INSIDE:
         circle = fit_circle(inside)
-        margin = max(1.5, 0.008 * max(size))  # the rim of a lens glows
+        margin = max(1.5, 0.01 * min(size))  # the rim of a lens glows
         if circle is not None:
             inside, shape = circle.mask(picture.shape, margin), "round"
         else:
