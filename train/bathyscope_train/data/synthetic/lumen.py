@@ -115,10 +115,11 @@ def _folds(random: np.random.Generator, z: Array, theta: Array) -> tuple[Array, 
 def _polyp(random: np.random.Generator, z: Array, theta: Array, radius: float) -> tuple[Array, Array]:
     """Height in millimetres of one round polyp, and the area that it covers."""
     size = random.uniform(2.0, 6.5)
+    height = random.uniform(0.6, 1.05) * size
     along = (z - random.uniform(10.0, z[-1] - 10.0))[:, None] / size
-    across = _angular(theta, random.uniform(0, 2 * np.pi)) * radius / size
+    across = _angular(theta, random.uniform(0, 2 * np.pi)) * (radius - 0.6 * height) / size
     inside = np.clip(1.0 - along**2 - across**2, 0.0, 1.0)
-    return np.float32(random.uniform(0.7, 1.3) * size * inside**0.6), np.float32(np.clip(3 * inside, 0, 1))
+    return np.float32(height * inside**0.45), np.float32(np.clip(3 * inside, 0, 1))
 
 
 def sinus(random: np.random.Generator, material: MaterialRanges) -> Scene:
