@@ -67,6 +67,21 @@ def test_images_are_rgb(tmp_path: Path) -> None:
     np.testing.assert_array_equal(DatasetFolder.open(write_folder(tmp_path / "set")).image(2)[0, 0], [102, 2, 1])
 
 
+@pytest.mark.parametrize(
+    "stored",
+    [
+        np.full((H, W, 4), (1 * 257, 2 * 257, 102 * 257, 65535), np.uint16),
+        np.full((H, W, 3), (1, 2, 102), np.uint8),
+        np.full((H, W, 4), (1, 2, 102, 255), np.uint8),
+    ],
+    ids=["16 bits with alpha", "8 bits", "8 bits with alpha"],
+)
+def test_frames_of_any_depth_and_transparency_become_8_bit_rgb(tmp_path: Path, stored: np.ndarray) -> None:
+    path = write_folder(tmp_path / "set")
+    cv2.imwrite(str(path / "frames" / "0000.png"), stored)
+    np.testing.assert_array_equal(DatasetFolder.open(path).image(0)[0, 0], [102, 2, 1])
+
+
 def test_zero_depth_the_mask_and_the_bounds_of_depth_valid_are_left_out(tmp_path: Path) -> None:
     path = write_folder(tmp_path / "set", depth_valid=[1.0, 3.0])
     values = np.tile(np.array([0, 2, 3, 4, 6, 7], np.uint16), (H, 1))
@@ -171,7 +186,7 @@ WRONG_PIXELS = {
     "damaged depth": (write("depth/0000.png", "\x89PNG"), r"depth/0000\.png: not a readable image"),
     "empty depth file": (write("depth/0000.png", ""), r"depth/0000\.png: not a readable image \(0 bytes\)"),
     "frame of another size": (image("frames/0000.png", np.ones((2, 3, 3), np.uint8)), r"frames/0000\.png: 3x2 .* 6x4"),
-    "grey frame": (image("frames/0000.png", np.ones((H, W), np.uint8)), r"frames/0000\.png: .*8-bit colour"),
+    "damaged frame": (write("frames/0000.png", "\x89PNG"), r"frames/0000\.png: not a readable image"),
 }
 
 

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from bathyscope.camera import F64, Size
 from bathyscope.errors import DatasetError
 from bathyscope_train.evaluation.calibration import Calibration, check_size, read_calibration
-from bathyscope_train.evaluation.images import image_files, read_image
+from bathyscope_train.evaluation.images import image_files, read_colour, read_values
 from bathyscope_train.evaluation.truth import TrueDepth, find_truth
 
 
@@ -53,11 +53,9 @@ class DatasetFolder:
             DatasetError: If it cannot be read, or is not of the size in ``intrinsics.json``.
         """
         path = self.frames[index]
-        bgr = read_image(path)
-        if bgr.ndim != 3 or bgr.dtype != np.uint8:
-            raise DatasetError(f"{path}: frames must be 8-bit colour images, got {bgr.dtype} {bgr.shape}")
-        check_size(path, bgr.shape, self.calibration.size)
-        return np.ascontiguousarray(bgr[..., 2::-1], np.uint8)
+        image = read_colour(path)
+        check_size(path, image.shape, self.calibration.size)
+        return image
 
     @classmethod
     def open(cls, path: Path | str) -> DatasetFolder:
@@ -84,7 +82,7 @@ class DatasetFolder:
 def _read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
     if not path.is_file():
         return np.ones(size, np.bool_)
-    values = read_image(path)
+    values = read_values(path)
     check_size(path, values.shape, size)
     return np.asarray((values if values.ndim == 2 else values[..., 0]) > 127)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bathyscope.errors import DatasetError
 
@@ -21,15 +22,32 @@ def image_files(folder: Path) -> tuple[Path, ...]:
     return tuple(sorted(files, key=_natural_key))
 
 
-def read_image(path: Path) -> Any:
-    """Pixels as stored: (h, w) grey or (h, w, c) with channels in OpenCV's order, BGR.
+def read_values(path: Path) -> Any:
+    """Pixels as stored: (h, w) grey or (h, w, c), of the type in the file.
 
     Raises:
         DatasetError: If the file is no image that OpenCV reads.
     """
     import cv2
 
-    image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), cv2.IMREAD_UNCHANGED)
+    return _decode(path, cv2.IMREAD_UNCHANGED)
+
+
+def read_colour(path: Path) -> NDArray[np.uint8]:
+    """RGB (h, w, 3), whatever the file holds: grey, 16 bits and transparency are converted, as decoders do.
+
+    Raises:
+        DatasetError: If the file is no image that OpenCV reads.
+    """
+    import cv2
+
+    return np.ascontiguousarray(_decode(path, cv2.IMREAD_COLOR)[..., ::-1], np.uint8)
+
+
+def _decode(path: Path, flags: int) -> Any:
+    import cv2
+
+    image = cv2.imdecode(np.frombuffer(path.read_bytes() or b"\0", np.uint8), flags)
     if image is None:
         raise DatasetError(f"{path}: not a readable image ({path.stat().st_size} bytes)")
     return image

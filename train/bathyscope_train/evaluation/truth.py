@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from bathyscope.camera import F64
 from bathyscope.errors import DatasetError
 from bathyscope_train.evaluation.calibration import Calibration, check_size
-from bathyscope_train.evaluation.images import image_files, read_image
+from bathyscope_train.evaluation.images import image_files, read_values
 
 MAX_FLOW_ERROR_PX = 1.0
 """Sparse observations that optical flow contradicts by more than this are outliers of the reconstruction."""
@@ -58,7 +58,7 @@ class DenseDepth:
         path = self.files.get(index)
         if path is None:
             return _nothing()
-        values = read_image(path)
+        values = read_values(path)
         if values.ndim != 2 or values.dtype != np.uint16:
             raise DatasetError(f"{path}: depth must be 16-bit grey PNG, got {values.dtype} {values.shape}")
         check_size(path, values.shape, self.calibration.size)
