@@ -28,7 +28,7 @@ DEMO = Domain(
 SEED = 0
 
 
-def write_video(path: Path, frames: npt.NDArray[np.uint8], *, rate: int = 15, quality: int = 21) -> None:
+def write_video(path: Path, frames: npt.NDArray[np.uint8], *, rate: int = 15, quality: int = 18) -> None:
     """Write frames ``(t, h, w, 3)`` as H.264 in an mp4.
 
     Args:

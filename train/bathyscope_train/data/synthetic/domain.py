@@ -83,7 +83,9 @@ class SensorRanges(_Ranges):
 
     gamma: Range = (2.2, 2.2)
     exposure: Range = (0.42, 0.55)
-    """Displayed brightness that the automatic exposure steers the 60th percentile to."""
+    """Displayed brightness that the automatic exposure steers the metered percentile to."""
+    metering: Range = (58.0, 62.0)
+    """The metered percentile: low lets near tissue burn out, high leaves the distance in the dark."""
     lag: Range = (0.0, 0.5)
     """Share of the last gain that the automatic exposure keeps a frame."""
     vignette: Range = (0.0, 0.4)

@@ -28,6 +28,7 @@ BROAD = Domain(
     sensor=SensorRanges(
         gamma=(1.6, 2.5),
         exposure=(0.3, 0.6),
+        metering=(35.0, 80.0),
         lag=(0.0, 0.7),
         vignette=(0.0, 0.9),
         clipping=(0.9, 1.25),

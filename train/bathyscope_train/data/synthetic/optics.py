@@ -11,7 +11,6 @@ from bathyscope_train.data.synthetic.domain import SensorRanges, draw
 Array = npt.NDArray[np.float32]
 
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
-_METERED_PERCENTILE = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,6 +19,7 @@ class Sensor:
 
     gamma: float
     exposure: float
+    metering: float
     lag: float
     vignette: float
     clipping: float
@@ -40,6 +40,7 @@ def draw_sensor(random: np.random.Generator, ranges: SensorRanges, size: tuple[i
     return Sensor(
         gamma=draw(random, ranges.gamma),
         exposure=draw(random, ranges.exposure),
+        metering=draw(random, ranges.metering),
         lag=draw(random, ranges.lag),
         vignette=draw(random, ranges.vignette),
         clipping=draw(random, ranges.clipping),
@@ -71,7 +72,7 @@ def gains(radiance: Array, sensor: Sensor) -> npt.NDArray[np.float64]:
     target = sensor.exposure**sensor.gamma
     result = np.empty(len(radiance))
     for index, frame in enumerate(radiance):
-        metered = float(np.percentile(frame[inside] @ _LUMINANCE, _METERED_PERCENTILE))
+        metered = float(np.percentile(frame[inside] @ _LUMINANCE, sensor.metering))
         wanted = target / max(metered, 1e-6)
         result[index] = wanted if index == 0 else result[index - 1] ** sensor.lag * wanted ** (1 - sensor.lag)
     return result
