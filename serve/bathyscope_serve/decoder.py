@@ -38,12 +38,13 @@ def confine(limits: DecodeLimits) -> None:
         libc.unshare(_CLONE_NEWUSER | _CLONE_NEWNET)  # refused in many containers; the whitelists hold without it
     bounds = {
         resource.RLIMIT_AS: limits.memory_bytes,
-        resource.RLIMIT_CPU: limits.cpu_s,
         resource.RLIMIT_FSIZE: 0,
         resource.RLIMIT_NOFILE: 64,
         resource.RLIMIT_NPROC: 0,
         resource.RLIMIT_CORE: 0,
     }
+    # the soft limit tells by SIGXCPU what happened; the hard one kills whoever ignores it
+    resource.setrlimit(resource.RLIMIT_CPU, (limits.cpu_s, limits.cpu_s + 5))
     for kind, bound in bounds.items():
         resource.setrlimit(kind, (bound, bound))
 

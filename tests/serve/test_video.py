@@ -6,6 +6,9 @@ import contextlib
 import io
 import os
 import random
+import signal
+import subprocess
+import sys
 import zipfile
 from fractions import Fraction
 from pathlib import Path
@@ -152,11 +155,31 @@ def test_a_small_file_of_many_black_4k_frames_is_refused(tmp_path: Path) -> None
         read(path, free_pixels=8_000_000, pixels_per_byte=1)
 
 
-def test_memory_is_bounded_in_the_decoding_process_not_in_ours(tmp_path: Path) -> None:
-    black = np.zeros((2160, 3840, 3), np.uint8)
-    path = write_video(tmp_path / "large.mp4", (black for _ in range(2)), codec="mpeg4")
-    with pytest.raises(ClipError, match=r"memory|broke off"):
-        read_isolated(path, memory_bytes=330 << 20)
+@pytest.mark.parametrize(
+    ("misuse", "outcome"),
+    [
+        ("while True: pass", -signal.SIGXCPU),
+        ("bytearray(3 << 30)", "MemoryError"),
+        ("open(sys.argv[1], 'w').write('x' * 99999)", "File too large"),
+        ("[os.dup(1) for _ in range(99)]", "Too many open files"),
+    ],
+    ids=["time", "memory", "disk", "files"],
+)
+def test_a_decoding_process_that_is_taken_over_can_use_up_little(
+    tmp_path: Path, misuse: str, outcome: int | str
+) -> None:
+    code = (
+        "import os, sys, signal; from bathyscope_serve.decoder import confine; "
+        "from bathyscope_serve.decode_limits import DecodeLimits; confine(DecodeLimits(cpu_s=1)); "
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n" + misuse
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(tmp_path / "x")], capture_output=True, text=True, timeout=120, check=False
+    )
+    if isinstance(outcome, str):
+        assert outcome in done.stderr
+    else:
+        assert done.returncode == outcome
 
 
 def test_a_decoder_that_does_not_answer_is_given_up(tmp_path: Path) -> None:
