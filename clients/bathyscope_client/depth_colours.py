@@ -13,6 +13,8 @@ from bathyscope.result import FrameDepth
 
 _SAMPLES_PER_FRAME = 2000
 _KEPT_SAMPLES = 1 << 20
+_COLDEST, _WARMEST = 24, 236
+"""Levels of the colour map that are used: its ends are nearly black, which stands for nothing here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,6 @@ def colour_depth(depth: NDArray[np.floating], valid: NDArray[np.bool_], span: Cl
     near = max(span.near, 1e-12)
     width = max(np.log(max(span.far, near) / near), 1e-6)
     logs = np.log(np.maximum(depth.astype(np.float32), 1e-12) / near) / width
-    levels = np.rint(255 * np.clip(1.0 - logs, 0.0, 1.0)).astype(np.uint8)
+    levels = np.rint(_COLDEST + (_WARMEST - _COLDEST) * np.clip(1.0 - logs, 0.0, 1.0)).astype(np.uint8)
     coloured = np.asarray(cv2.applyColorMap(levels, cv2.COLORMAP_TURBO)[..., ::-1], np.uint8)
     return np.where(valid[..., None], coloured, np.uint8(0))

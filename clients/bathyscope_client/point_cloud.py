@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.camera import unproject
+from bathyscope.camera import unproject_pixels
 from bathyscope.result import FrameDepth
 from bathyscope_client.depth_colours import ClipRange
 
@@ -56,10 +56,13 @@ class CloudWriter:
         candidates = np.flatnonzero(frame.valid & (frame.confidence >= self._span.sure) & ~steep(frame.depth))
         wanted = min(self._share, len(candidates), self._most - self._count)
         picked = self._random.choice(candidates, wanted, replace=False) if wanted else candidates[:0]
+        rows, columns = np.unravel_index(picked, frame.depth.shape)
+        pixels = np.stack([columns, rows], -1) + 0.5
         vertices = np.empty(len(picked), VERTEX)
-        points = unproject(frame.depth, frame.intrinsics, frame.world_from_camera)
-        vertices["position"] = points.reshape(-1, 3)[picked]
-        vertices["colour"] = image.reshape(-1, 3)[picked]
+        vertices["position"] = unproject_pixels(
+            pixels, frame.depth[rows, columns], frame.intrinsics, frame.world_from_camera
+        )
+        vertices["colour"] = image[rows, columns]
         self._body.write(vertices.tobytes())
         self._count += len(vertices)
 

@@ -60,7 +60,11 @@ def pixel_grid(size: Size) -> F64:
 
 def unproject(depth: NDArray[np.floating], intrinsics: F64, world_from_camera: F64) -> F64:
     """World points (h, w, 3) of a z-depth map (h, w): the paper's Eq. 3."""
-    pixels = pixel_grid((depth.shape[0], depth.shape[1]))
+    return unproject_pixels(pixel_grid((depth.shape[0], depth.shape[1])), depth, intrinsics, world_from_camera)
+
+
+def unproject_pixels(pixels: F64, depth: NDArray[np.floating], intrinsics: F64, world_from_camera: F64) -> F64:
+    """World points (..., 3) of pixels (..., 2) with z-depths (...)."""
     x = (pixels[..., 0] - intrinsics[0, 2]) / intrinsics[0, 0]
     y = (pixels[..., 1] - intrinsics[1, 2]) / intrinsics[1, 1]
     points = np.stack([x, y, np.ones_like(x)], -1) * depth[..., None].astype(np.float64)
