@@ -57,7 +57,7 @@ class CloudWriter:
         wanted = min(self._share, len(candidates), self._most - self._count)
         picked = self._random.choice(candidates, wanted, replace=False) if wanted else candidates[:0]
         rows, columns = np.unravel_index(picked, frame.depth.shape)
-        pixels = np.stack([columns, rows], -1) + 0.5
+        pixels = np.stack([columns, rows], -1).astype(np.float64) + 0.5
         vertices = np.empty(len(picked), VERTEX)
         vertices["position"] = unproject_pixels(
             pixels, frame.depth[rows, columns], frame.intrinsics, frame.world_from_camera
