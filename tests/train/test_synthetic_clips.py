@@ -24,6 +24,7 @@ from bathyscope_train.data.synthetic import (
 )
 from bathyscope_train.data.synthetic.clip import draw_scene
 from bathyscope_train.data.synthetic.optics import Sensor, develop, gains
+from bathyscope_train.evaluation.folders import DatasetFolder
 
 SIZE = (28, 35)
 
@@ -227,3 +228,13 @@ def test_a_data_set_folder_holds_the_clip_in_plain_files(tmp_path: Path) -> None
         np.testing.assert_allclose(stored * intrinsics["depth_scale"], clip.depth[index], atol=0.01)
     mask = cv2.imread(str(tmp_path / "mask.png"), cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(mask == 255, clip.valid.any(axis=0))
+
+
+def test_the_evaluation_reads_a_data_set_folder_as_the_clip_it_was(tmp_path: Path) -> None:
+    clip = render_clip(2, always_masked(), frames=2, size=SIZE)
+    write_dataset_folder(clip, tmp_path)
+    folder = DatasetFolder.open(tmp_path)
+    assert folder.has_pose.all()
+    np.testing.assert_allclose(folder.world_from_camera, clip.world_from_camera, atol=1e-9)
+    np.testing.assert_array_equal(folder.image(1), clip.frames[1])
+    assert folder.calibration.size == SIZE
