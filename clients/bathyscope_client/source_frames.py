@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from collections.abc import Generator, Iterable, Iterator
-from contextlib import closing
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import BinaryIO
 
 import av
 import cv2
 import numpy as np
+from av.container import InputContainer
+from av.video.frame import VideoFrame
+from av.video.stream import VideoStream
 from numpy.typing import NDArray
 
 from bathyscope.errors import ClipError
@@ -56,19 +61,29 @@ def source_frames(path: Path) -> Generator[SourceFrame]:
 
 
 def _video(path: Path) -> Generator[SourceFrame]:
-    with path.open("rb") as file, av.open(file, mode="r", options={"protocol_whitelist": ""}) as container:
+    previous_s: float | None = None
+    with path.open("rb") as file, _opened(file, path) as container:
         stream = next(s for s in container.streams.video if not s.disposition & av.stream.Disposition.attached_pic)
         interval_s = float(1 / stream.average_rate) if stream.average_rate else 1 / IMAGE_RATE
-        previous_s: float | None = None
+        for frame in _decoded(container, stream):
+            previous_s = _time(frame.time, previous_s, interval_s)
+            image = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+            yield SourceFrame(previous_s, np.rot90(image, round(frame.rotation / 90) % 4))
+
+
+def _opened(file: BinaryIO, path: Path) -> InputContainer:
+    try:
+        return av.open(file, mode="r", options={"protocol_whitelist": ""})
+    except (av.FFmpegError, ValueError) as error:
+        raise ClipError(f"{path.name}: cannot be decoded for the pictures ({error})") from error
+
+
+def _decoded(container: InputContainer, stream: VideoStream) -> Iterator[VideoFrame]:
+    """Every frame that decodes; damaged packets are skipped and a damaged end ends it, as in the engine."""
+    with suppress(av.FFmpegError):
         for packet in container.demux(stream):
-            try:
-                decoded = packet.decode()
-            except av.FFmpegError:
-                continue
-            for frame in decoded:
-                previous_s = _time(frame.time, previous_s, interval_s)
-                image = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
-                yield SourceFrame(previous_s, np.rot90(image, round(frame.rotation / 90) % 4))
+            with suppress(av.FFmpegError):
+                yield from packet.decode()
 
 
 def _time(time_s: float | None, previous_s: float | None, interval_s: float) -> float:
@@ -81,7 +96,15 @@ def _time(time_s: float | None, previous_s: float | None, interval_s: float) -> 
 def _zipped(path: Path) -> Generator[SourceFrame]:
     with zipfile.ZipFile(path) as archive:
         names = [name for name in archive.namelist() if _is_image(PurePosixPath(name))]
-        yield from _images(archive.read(name) for name in sorted(names, key=natural_key))
+        yield from _images(_member(archive, name) for name in sorted(names, key=natural_key))
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> bytes:
+    """A picture's bytes; nothing where the zip is damaged, as in the engine."""
+    try:
+        return archive.read(name)
+    except (zipfile.BadZipFile, EOFError, zlib.error):
+        return b""
 
 
 def _is_image(path: PurePosixPath) -> bool:
@@ -90,6 +113,6 @@ def _is_image(path: PurePosixPath) -> bool:
 
 def _images(files: Iterable[bytes]) -> Generator[SourceFrame]:
     for number, data in enumerate(files):
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
         if image is not None:
             yield SourceFrame(number / IMAGE_RATE, np.ascontiguousarray(image[..., ::-1]))

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import time
+import uuid
 
+import h11
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from bathyscope_serve.problems import ProblemError
+from bathyscope_serve.problems import ProblemError, problem_response
 
 _LINGER_S = 2.0
 
@@ -121,7 +123,8 @@ def _lingering(body: Body, send: Send) -> Send:
 class DeadlineProtocol(H11Protocol):
     """uvicorn's HTTP protocol, closing connections whose request head takes too long to arrive.
 
-    uvicorn by itself waits for a head without end; an ASGI app cannot see it, because it is called afterwards.
+    uvicorn by itself waits for a head without end; an ASGI app cannot see it, because it is called afterwards. Nor does
+    it see heads that are no HTTP: these are answered with a problem like everything else.
     """
 
     header_timeout_s = 10.0
@@ -144,6 +147,20 @@ class DeadlineProtocol(H11Protocol):
         """Stop the clock."""
         self._forget_head()
         super().connection_lost(exc)
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP request, and close."""
+        request_id = uuid.uuid4().hex
+        answer = problem_response(ProblemError(400, "not-http", "this is no HTTP/1.1 request"), request_id)
+        headers = [*answer.raw_headers, (b"x-request-id", request_id.encode()), (b"connection", b"close")]
+        events = (
+            h11.Response(status_code=400, headers=headers, reason=b"Bad Request"),
+            h11.Data(data=bytes(answer.body)),
+            h11.EndOfMessage(),
+        )
+        for event in events:
+            self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
 
     def _idle(self) -> bool:
         return self.cycle is None or self.cycle.response_complete

@@ -18,6 +18,8 @@ from bathyscope.tum import read_tum
 from bathyscope_client.depth_colours import ClipRange, colour_depth, measure_range
 from bathyscope_client.outputs import output_paths, write_outputs
 from bathyscope_client.point_cloud import VERTEX, steep
+from bathyscope_client.source_frames import source_frames
+from bathyscope_client.upload import pack_images
 
 SIZE = (24, 32)
 
@@ -190,9 +192,6 @@ def test_sheet_has_frames_over_depth(made: dict[str, Path]) -> None:
 
 @pytest.mark.parametrize("zipped", [False, True])
 def test_images_are_paired_in_natural_order(tmp_path: Path, zipped: bool) -> None:
-    from bathyscope_client.source_frames import source_frames
-    from bathyscope_client.upload import pack_images
-
     source = write_images(tmp_path / "images", 12, SIZE)
     if zipped:
         with (tmp_path / "images.zip").open("wb") as file:
@@ -207,3 +206,16 @@ def test_a_result_of_another_video_is_not_painted_over_this_one(tmp_path: Path) 
     source = write_video(tmp_path / "s.mp4", 2, SIZE)
     with pytest.raises(ClipError, match=r"no frame at 0\.0800 s"):
         make(tmp_path, source, [plane(t, SIZE) for t in range(3)])
+
+
+def test_a_damaged_picture_leaves_a_gap_in_time(tmp_path: Path) -> None:
+    folder = write_images(tmp_path / "images", 4, SIZE)
+    (folder / "f1.png").write_bytes(b"damaged")
+    (folder / "f2.png").write_bytes(b"")
+    assert [frame.timestamp_s for frame in source_frames(folder)] == [0.0, 3 / 25]
+
+
+def test_a_file_that_is_no_video_is_a_clip_error(tmp_path: Path) -> None:
+    (tmp_path / "a.mp4").write_bytes(b"text")
+    with pytest.raises(ClipError, match=r"a\.mp4"):
+        list(source_frames(tmp_path / "a.mp4"))

@@ -1,5 +1,6 @@
 """The service on a real socket: limits while bytes arrive, clients that leave, what stays behind."""
 
+import json
 import socket
 import threading
 import time
@@ -108,6 +109,15 @@ def test_a_head_that_trickles_is_cut_at_the_deadline(tmp_path: Path) -> None:
         line.settimeout(5)
         line.sendall(b"GET /healthz HTTP/1.1\r\nHost:")
         assert read_all(line) == b""
+
+
+def test_what_is_no_http_is_a_problem_with_a_request_id_too(tmp_path: Path) -> None:
+    app = create_app(FakeEngine(), ServiceSettings(temp=tmp_path))
+    with live_server(app) as (host, port), socket.create_connection((host, port)) as line:
+        line.sendall(b"GET / HTTP/1.1\r\nno colon\r\n\r\n")
+        top, body = read_all(line).split(b"\r\n\r\n")
+    assert top.startswith(b"HTTP/1.1 400 ")
+    assert f"x-request-id: {json.loads(body)['request_id']}".encode() in top
 
 
 def test_the_deadline_of_the_head_spares_slow_estimates_and_idle_connections(tmp_path: Path) -> None:
