@@ -153,14 +153,17 @@ def _check_background(background: Matrix | None) -> Floats | None:
 
 def _check_scene(scene: Gaussians) -> None:
     for name in ("means", "rotations", "scales", "opacities"):
-        bad = np.flatnonzero(~np.isfinite(getattr(scene, name)).reshape(len(scene), -1).all(-1))
-        if len(bad):
+        finite = np.isfinite(getattr(scene, name))
+        if not finite.all():
+            bad = np.flatnonzero(~finite.reshape(len(scene), -1).all(-1))
             raise GeometryError(f"{name} of {len(bad)} Gaussians are not finite, the first is number {bad[0]}")
+    lengths = np.einsum("ni,ni->n", scene.rotations, scene.rotations)
     wrong = {
-        "a negative scale": (scene.scales < 0).any(-1),
+        "a negative scale": scene.scales < 0,
         "an opacity outside [0, 1]": (scene.opacities < 0) | (scene.opacities > 1),
-        "a rotation of length 0": ~scene.rotations.any(-1),
+        "a rotation of length 0": lengths <= 0,
     }
     for what, mask in wrong.items():
         if mask.any():
-            raise GeometryError(f"{mask.sum()} Gaussians have {what}, the first is number {mask.argmax()}")
+            bad = np.flatnonzero(mask.reshape(len(scene), -1).any(-1))
+            raise GeometryError(f"{len(bad)} Gaussians have {what}, the first is number {bad[0]}")
