@@ -114,9 +114,7 @@ class Matcher(nn.Module):
         far = (queries[:, None] - keys[None]).abs().amax(-1) > _REACH
         limited = logits + _OUT_OF_REACH * far.to(logits.dtype)
         normaliser = limited.logsumexp(-1)
-        peak = limited.argmax(-1)
-        column = torch.remainder(peak, gw)
-        start = torch.stack([column, torch.div(peak - column, gw, rounding_mode="floor")], -1).to(logits.dtype) + 0.5
+        start = keys[limited.argmax(-1)]
         maps = logits.unflatten(2, (gh, gw))
         window = look_up(maps, start)
         share = window.softmax(-1)
