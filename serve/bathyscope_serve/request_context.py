@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import re
 import time
 import uuid
@@ -9,7 +10,7 @@ import uuid
 import structlog
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from bathyscope_serve.problems import as_problem, problem_response
+from bathyscope_serve.problems import ProblemError, as_problem, problem_response
 
 _ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
 _SAFETY = (
@@ -21,6 +22,9 @@ _SAFETY = (
         b"content-security-policy",
         b"default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'; frame-ancestors 'none'",
     ),
+)
+STOPPING = ProblemError(
+    503, "stopping", "the service is being stopped and did not finish this in time", headers={"Retry-After": "30"}
 )
 _log = structlog.get_logger("bathyscope.serve")
 
@@ -44,6 +48,11 @@ class RequestContext:
         began = time.monotonic()
         try:
             await self._app(scope, receive, answer.send)
+        except asyncio.CancelledError:
+            notes["problem"] = STOPPING.code
+            if answer.status is None:
+                await problem_response(STOPPING, answer.request_id)(scope, receive, answer.send)
+            raise
         except Exception as error:
             notes["problem"] = as_problem(error).code
             if answer.status is None:

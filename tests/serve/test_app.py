@@ -308,3 +308,43 @@ def test_a_failure_is_logged_with_its_reason(tmp_path: Path) -> None:
     (failure,) = [line for line in lines if line["event"] == "request_failed"]
     assert failure["request_id"] == answer.json()["request_id"]
     assert "secret inner detail" in str(failure["exc_info"])
+
+
+def test_a_request_that_the_service_cancels_is_told_to_come_back(tmp_path: Path) -> None:
+    """What uvicorn does to requests that outlast the time to drain."""
+
+    async def run() -> tuple[list[dict[str, Any]], FakeEngine]:
+        engine = FakeEngine(frames=1000, delay_s=0.02)
+        app = create_app(engine, ServiceSettings(temp=tmp_path))
+        sent: list[dict[str, Any]] = []
+        body = iter([{"type": "http.request", "body": b"clip", "more_body": False}])
+
+        async def receive() -> dict[str, Any]:
+            if (message := next(body, None)) is not None:
+                return message
+            await asyncio.sleep(60)
+            raise AssertionError
+
+        async def send(message: Any) -> None:
+            sent.append(message)
+
+        scope = {
+            "type": "http", "method": "POST", "path": "/depth", "query_string": b"", "client": ("t", 1),
+            "headers": [(b"content-type", b"video/mp4"), (b"content-length", b"4")],
+        }  # fmt: skip
+        async with app.router.lifespan_context(app):
+            while app.state.service.state == "starting":
+                await asyncio.sleep(0.001)
+            task = asyncio.create_task(app(scope, receive, send))
+            while not engine.runs:
+                await asyncio.sleep(0.01)
+            task.cancel()
+            await asyncio.wait({task})
+            assert task.cancelled()
+        return sent, engine
+
+    sent, engine = asyncio.run(run())
+    assert sent[0]["status"] == 503
+    assert json.loads(sent[1]["body"])["type"].endswith(":stopping")
+    assert engine.runs[0].closed
+    assert list(tmp_path.iterdir()) == []
