@@ -16,7 +16,7 @@ from bathyscope.splat.view import View
 
 TILE = 8
 """Pixels along the side of a tile; measured best for Gaussians of a few pixels."""
-SLAB = 128
+SLAB = 512
 """Gaussians blended before asking whether a tile is finished."""
 OPACITY_FLOOR = 1e-10
 """What the depth is divided by where nothing was blended."""

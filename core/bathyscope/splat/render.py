@@ -57,9 +57,10 @@ def prepare(scene: Gaussians, *, settings: SplatSettings = DEFAULTS, backend: Ba
     _check_precision(backend, settings)
     try:
         from bathyscope.splat.compiled import CompiledScene
-    except ImportError as error:
+    except (ImportError, RuntimeError) as error:  # numba raises RuntimeError where it cannot keep its cache
         raise SettingsError(
-            f"the numba splat backend cannot be imported ({error}); install bathyscope[serve] or pass backend='numpy'"
+            f"the numba splat backend cannot be used ({error}); install bathyscope[serve], point NUMBA_CACHE_DIR to "
+            "a folder that can be written, or pass backend='numpy'"
         ) from error
     return PreparedScene(scene, backend, CompiledScene.of(scene))
 

@@ -116,7 +116,8 @@ class ReferenceRenderer:
         blended = [
             checkpoint(blend, part, found, features, self.settings, use_reentrant=False) for part in pixels.split(step)
         ]
-        return torch.cat(blended).T.unflatten(-1, (height, width))
+        planes: Tensor = torch.cat(blended).T.unflatten(-1, (height, width))
+        return planes
 
 
 def blend(
