@@ -137,3 +137,17 @@ def test_the_steps_of_the_image_give_a_service_that_is_healthy(tmp_path: Path) -
         port = url.rsplit(":", 1)[1]
         subprocess.run([python, *check[1:]], env={"BATHYSCOPE_PORT": port}, check=True)
         assert httpx.get(f"{url}/bundle", trust_env=False).is_success
+
+
+def test_the_document_lists_every_setting_with_its_default() -> None:
+    text = (ROOT / "docs" / "service.md").read_text().split("## Settings")[1]
+    rows = [[cell.strip() for cell in line.split("|")[1:3]] for line in text.splitlines() if line.startswith("| `")]
+    documented = {
+        name.strip("` "): default.strip()
+        for names, defaults in rows
+        for name, default in zip(names.split(","), defaults.split(",") * len(names.split(",")), strict=False)
+    }
+    assert set(documented) == set(ServiceSettings.model_fields)
+    numbers = {name: float(default) for name, default in documented.items() if default.isdecimal()}
+    fields = ServiceSettings.model_fields
+    assert numbers == {name: field.default for name, field in fields.items() if isinstance(field.default, int | float)}
