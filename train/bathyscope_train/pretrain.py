@@ -17,12 +17,13 @@ from bathyscope_train.config import PretrainSettings
 from bathyscope_train.data.truth_clips import read_truth_clips
 from bathyscope_train.data.windows import Batch, TruthClip, sample_window, stack
 from bathyscope_train.losses.supervised import supervised_objective
+from bathyscope_train.model.checkpoints import load_network, save_checkpoint
 from bathyscope_train.model.matching_camera_head import MatchingCameraHead
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import get_preset
 from bathyscope_train.model.trajectory import GAPS
 from bathyscope_train.schedule import ema_decay, learning_rate_factor, source_shares
-from bathyscope_train.training_state import read_state, read_weights, write_state, write_weights
+from bathyscope_train.training_state import read_state, write_state
 from bathyscope_train.validation import Validation, validate, write_grid
 from bathyscope_train.workers import average, launch, share_gradients
 
@@ -160,8 +161,7 @@ class _Run:
 
     def validate(self) -> None:
         """Measure the running average on the held-out clips."""
-        network = Network(self.network.preset)
-        network.load_state_dict(self.average)
+        network = self.averaged()
         examples = []
         for folder, clips in zip(self.settings.validation, self.held_out, strict=True):
             result, pictures = validate(network, clips, frames=self.settings.frames)
@@ -170,11 +170,17 @@ class _Run:
             examples += pictures[:6]
         write_grid(self.settings.out / "validation.png", examples)
 
+    def averaged(self) -> Network:
+        """The network with the running average of the weights."""
+        network = Network(self.network.preset)
+        network.load_state_dict(self.average)
+        return network.eval()
+
     def save(self) -> None:
         """Write weights and state."""
         self.position.elapsed_s = time.monotonic() - self.started
-        provenance = {"step": self.position.step, "settings": json.loads(self.settings.model_dump_json())}
-        write_weights(self.settings.out / WEIGHTS_FILE, self.network, self.average, provenance)
+        training = {"step": self.position.step, "settings": json.loads(self.settings.model_dump_json())}
+        save_checkpoint(self.averaged(), self.settings.out / WEIGHTS_FILE, training=training)
         write_state(self.settings.out, self.network, self.average, self.optimizer, self.position)
 
     def write(self, values: dict[str, Any]) -> None:
@@ -191,7 +197,7 @@ def initial_network(settings: PretrainSettings) -> Network:
         SettingsError: If the network's camera head cannot be supervised by matches.
     """
     torch.manual_seed(settings.seed)
-    network = read_weights(settings.initial) if settings.initial else Network(get_preset(settings.preset))
+    network = load_network(settings.initial)[0] if settings.initial else Network(get_preset(settings.preset))
     if not isinstance(network.camera_head, MatchingCameraHead):
         raise SettingsError(
             f"preset {network.preset.name!r} has no matching camera head; pre-training needs one, as in 'tiny'"

@@ -1,19 +1,15 @@
-"""A training run on disk: weights, running average, optimiser and position; written whole or not at all."""
+"""What a training run needs to go on: weights, running average, optimiser, position; written whole or not at all."""
 
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from pickle import UnpicklingError
 
 import torch
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from bathyscope.errors import CheckpointError
 from bathyscope_train.model.network import Network
-from bathyscope_train.model.presets import NetworkPreset
 
 STATE_FILE = "state.pt"
 
@@ -24,36 +20,6 @@ class Position:
 
     step: int = 0
     elapsed_s: float = 0.0
-
-
-def write_weights(path: Path, network: Network, weights: dict[str, Tensor], provenance: dict[str, Any]) -> None:
-    """Write weights as safetensors, with the preset and where they come from in the header."""
-    metadata = {"preset": network.preset.model_dump_json(), "provenance": json.dumps(provenance, default=str)}
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    save_file({name: value.detach().contiguous().clone() for name, value in weights.items()}, beside, metadata)
-    beside.replace(path)
-
-
-def read_weights(path: Path) -> Network:
-    """The network that :func:`write_weights` wrote, built from the preset in the file's header.
-
-    Raises:
-        CheckpointError: If the file is missing, damaged, has no preset or does not fit it.
-    """
-    try:
-        with safe_open(path, framework="pt") as file:
-            preset = (file.metadata() or {}).get("preset")
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path}: cannot read the checkpoint: {error}") from error
-    if preset is None:
-        raise CheckpointError(f"{path}: its header names no preset; only files written by `bathyscope train` do")
-    network = Network(NetworkPreset.model_validate_json(preset))
-    try:
-        network.load_state_dict(weights)
-    except RuntimeError as error:
-        raise CheckpointError(f"{path}: weights do not fit the preset in the header: {error}") from error
-    return network
 
 
 def write_state(
@@ -89,5 +55,5 @@ def read_state(
         optimizer.load_state_dict(state["optimizer"])
         average.update(state["average"])
         return Position(state["step"], state["elapsed_s"])
-    except (OSError, RuntimeError, KeyError, ValueError) as error:
+    except (OSError, RuntimeError, KeyError, ValueError, UnpicklingError) as error:
         raise CheckpointError(f"{path}: cannot resume from it ({error}); choose another folder or delete it") from error

@@ -1,0 +1,1 @@
+"""Training losses: supervised terms with exact truth, and what they are compared with."""
