@@ -245,7 +245,8 @@ class VideoReader:
 
 def upright(frame: VideoFrame) -> NDArray[np.uint8]:
     """RGB pixels (h, w, 3) of a frame, turned as its rotation metadata says."""
-    image = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+    # one thread: the decoding process may not start any
+    image = np.asarray(frame.to_ndarray(format="rgb24", threads=1), np.uint8)
     return np.rot90(image, round(frame.rotation / 90) % 4) if frame.rotation else image
 
 

@@ -152,3 +152,21 @@ def test_results_say_how_they_were_made() -> None:
 
 def test_the_entry_point_leads_to_this_engine() -> None:
     assert engine_factory() is DepthEngine
+
+
+def test_a_video_file_goes_all_the_way_through_decoder_graphs_and_splatter(tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    from made_bundle import write_bundle
+    from made_videos import ramp, write_video
+
+    (tmp_path / "bundle").mkdir()
+    engine = DepthEngine(write_bundle(tmp_path / "bundle"), EngineSettings(threads=1))
+    video = write_video(tmp_path / "clip.mp4", [ramp(i) for i in range(9)])
+    result = engine.depth_of(video)
+    assert result.depth.shape == (9, 48, 64)
+    assert result.meta.name == "clip"
+    assert result.meta.complete
+    assert result.valid.all()
+    assert (result.depth > 0).all()
+    assert np.isfinite(result.confidence).all()
+    np.testing.assert_allclose(result.timestamps_s, np.arange(9) / 25, atol=1e-6)

@@ -326,3 +326,12 @@ def test_a_refusal_crosses_the_process_border_in_words(tmp_path: Path) -> None:
 def test_numbers_in_names_count_as_numbers() -> None:
     names = ["b1", "a10", "a9", "a09b", "a", "10", "9"]
     assert sorted(names, key=natural_key) == ["9", "10", "a", "a9", "a09b", "a10", "b1"]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="counts threads as Linux shows them")
+def test_decoding_starts_no_thread_because_it_may_not_when_confined(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.mp4", [ramp(i, (480, 640)) for i in range(4)])
+    before = len(os.listdir("/proc/self/task"))
+    with path.open("rb") as file:
+        for _ in open_reader(file.fileno(), "a", DecodeLimits()).frames():
+            assert len(os.listdir("/proc/self/task")) <= before
