@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import typer
 
 from bathyscope.engines import DepthOptions
-from bathyscope.errors import BathyscopeError, ServiceError
+from bathyscope.errors import BathyscopeError, ServiceError, SettingsError
 from bathyscope.result_files import Precision
 from bathyscope_client.batch import BatchSettings, ClipReport, run_batch
 from bathyscope_client.client import DepthClient
@@ -60,6 +60,7 @@ def depth(  # noqa: PLR0917 - typer: one parameter an option
     with ExitStack() as held:
         try:
             clips = find_clips(source)
+            _check(source, out, url, bundle)
             runner = _runner(url, bundle, held)
         except BathyscopeError as error:
             typer.echo(f"bathyscope depth: {error}", err=True)
@@ -69,6 +70,13 @@ def depth(  # noqa: PLR0917 - typer: one parameter an option
         typer.echo(json.dumps([report.model_dump(mode="json") for report in reports], indent=1))
     if any(report.status == "failed" for report in reports):
         raise typer.Exit(_SOME_FAILED)
+
+
+def _check(source: Path, out: Path, url: str | None, bundle: Path | None) -> None:
+    if url is not None and bundle is not None:
+        raise SettingsError("a service brings its own bundle; give either --url or --bundle (or unset BATHYSCOPE_URL)")
+    if source.is_dir() and out.resolve() == source.resolve():
+        raise SettingsError(f"{out} holds the clips; outputs there would be taken for clips, so give another --out")
 
 
 def _runner(url: str | None, bundle: Path | None, held: ExitStack) -> Runner:

@@ -151,6 +151,16 @@ def test_command_exits_with_2_for_wrong_usage(monkeypatch: pytest.MonkeyPatch, a
     assert command(monkeypatch, *arguments).exit_code == 2
 
 
+def test_command_refuses_what_would_be_silently_ignored_or_taken_for_a_clip(
+    videos: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = command(monkeypatch, videos, "-o", tmp_path / "out", "--url", "http://t", "--bundle", tmp_path)
+    inside = command(monkeypatch, videos, "-o", videos)
+    assert (both.exit_code, inside.exit_code) == (2, 2)
+    assert "either --url or --bundle" in both.stderr
+    assert "another --out" in inside.stderr
+
+
 def test_command_exits_with_2_for_a_missing_bundle(videos: Path, tmp_path: Path) -> None:
     arguments = [str(videos), "-o", str(tmp_path / "out"), "--bundle", str(tmp_path / "no-bundle")]
     outcome = CliRunner(env={"BATHYSCOPE_URL": ""}).invoke(cli.app, arguments)
