@@ -103,8 +103,8 @@ def choose_size(crop: Size, patch: int, pixels: int) -> Size:
     ideal = np.sqrt(pixels / aspect) / patch, np.sqrt(pixels * aspect) / patch
     candidates = [
         (rows, columns)
-        for rows in range(max(2, int(ideal[0]) - 1), int(ideal[0]) + 3)
-        for columns in range(max(2, int(ideal[1]) - 1), int(ideal[1]) + 3)
+        for rows in range(max(3, int(ideal[0]) - 1), int(ideal[0]) + 3)
+        for columns in range(max(3, int(ideal[1]) - 1), int(ideal[1]) + 3)
     ]
 
     def cost(size: tuple[int, int]) -> float:
