@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bathyscope.bundle import SceneSpec
 from bathyscope.errors import GeometryError
+from bathyscope.scene import WindowMaps
+from bathyscope.scene import assemble_scene as numpy_scene
 from bathyscope.splat import render
 from bathyscope_train.model.gaussian_parameters import CONSTANT_HARMONIC, GaussianBatch, map_opacity
 from bathyscope_train.model.harmonics import evaluate_harmonics, rotate_harmonics
@@ -74,6 +77,31 @@ def test_rebasing_changes_no_rendering(settings: SceneSettings, degree: int) -> 
             close = np.isclose(observed, expected, atol=2e-4)
             assert close.mean() > 0.99
             assert np.abs(observed - expected).max() < 2e-2
+
+
+@pytest.mark.parametrize("settings", [ANYSPLAT, FUSED, FOOTPRINT], ids=["anysplat", "fused", "footprint"])
+def test_the_service_assembles_the_same_scene_in_numpy(settings: SceneSettings) -> None:
+    prediction, images = random_prediction(degree=2)
+    assert prediction.maps.gaussians is not None
+    expected = assemble_scene(prediction, images, settings)
+    values = (prediction.maps.depth, prediction.maps.confidence, prediction.maps.gaussians, prediction.pose_encoding)
+    spec = SceneSpec(
+        pixel_centre=0.5 if settings.pixel_center else 0.0,
+        focal_epsilon=settings.focal_epsilon,
+        activation=settings.activation,
+        sh_degree=2,
+        voxel_size=settings.voxel_size,
+    )
+    observed = numpy_scene(WindowMaps(*(value[0].numpy() for value in values)), images[0].numpy(), spec)
+    np.testing.assert_allclose(observed.cameras.world_from_camera, expected.world_from_camera[0], atol=1e-5)
+    np.testing.assert_allclose(observed.cameras.intrinsics, expected.intrinsics[0], rtol=1e-5)
+    wanted = expected.numpy()
+    np.testing.assert_allclose(observed.gaussians.means, wanted.means, atol=1e-4)
+    np.testing.assert_allclose(observed.gaussians.scales, wanted.scales, rtol=1e-4)
+    np.testing.assert_allclose(observed.gaussians.opacities, wanted.opacities, atol=1e-5)
+    np.testing.assert_allclose(observed.gaussians.harmonics, wanted.harmonics, atol=1e-3)
+    alignment = np.abs((observed.gaussians.rotations * wanted.rotations).sum(1))
+    np.testing.assert_allclose(alignment, 1, atol=1e-3)
 
 
 def test_rebasing_keeps_relative_poses() -> None:

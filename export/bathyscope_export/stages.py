@@ -1,0 +1,152 @@
+"""A network cut into the three graphs of a bundle, as modules with named inputs and outputs.
+
+``backbone`` sees a whole clip; ``heads`` work frame by frame, so that a runtime can feed them a few frames at a
+time; ``cameras`` see the clip again, but only what they need of it.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from bathyscope.bundle import Role
+from bathyscope.errors import CheckpointError
+from bathyscope_train.model.network import Features, Network
+
+_FRAMES, _ROWS, _COLUMNS = 4, 8, 10
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One part of a network, ready to be traced."""
+
+    role: Role
+    module: nn.Module
+    arguments: tuple[Tensor, ...]
+    """Example inputs; their sizes all differ, so that none is mistaken for another or for a constant."""
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+
+def split(network: Network) -> tuple[Stage, ...]:
+    """Backbone, heads and cameras of a network.
+
+    Raises:
+        CheckpointError: If the network has no Gaussian head; the service renders Gaussians.
+    """
+    if network.gaussian_param_head is None:
+        raise CheckpointError(f"the {network.preset.name!r} network has no Gaussian head; a bundle needs one")
+    patch = network.preset.patch_size
+    images = torch.rand(_FRAMES, 3, patch * _ROWS, patch * _COLUMNS, generator=torch.Generator().manual_seed(0))
+    backbone = Backbone(network)
+    with torch.no_grad():
+        features = backbone(images)
+    taps = len(network.preset.aggregator.taps)
+    tokens = tuple(f"tokens_{index}" for index in range(taps))
+    stem = tuple(f"stem_{index}" for index in range(len(features) - taps - 1))
+    named = dict(zip((*tokens, "camera", *stem), features, strict=True))
+    return (
+        Stage("backbone", backbone, (images,), ("images",), tuple(named)),
+        Stage(
+            "heads",
+            Heads(network),
+            (images, *(named[name] for name in (*tokens, *stem))),
+            ("images", *tokens, *stem),
+            ("depth", "confidence", "gaussians"),
+        ),
+        _camera_stage(network, named, torch.ones(_FRAMES, *images.shape[-2:])),
+    )
+
+
+def _camera_stage(network: Network, named: Mapping[str, Tensor], depth: Tensor) -> Stage:
+    """Only what the camera head reads: an input that is traced and not read would still be asked for."""
+    if network.preset.camera.kind == "iterative":
+        return Stage("cameras", TokenCameras(network), (named["camera"],), ("camera",), ("pose_encoding",))
+    tokens = max(name for name in named if name.startswith("tokens_"))
+    stem = max(name for name in named if name.startswith("stem_"))
+    return Stage(
+        "cameras",
+        MatchingCameras(network, halvings=1 + int(stem.removeprefix("stem_"))),
+        (depth, *(named[name] for name in ("camera", tokens, stem))),
+        ("depth", "camera", tokens, stem),
+        ("pose_encoding",),
+    )
+
+
+class Backbone(nn.Module):
+    """Images (t, 3, h, w) to tokens (t, rows, columns, c) of each tap, camera tokens (t, c) and stem maps."""
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        patch = self.network.preset.patch_size
+        grid = (images.shape[2] // patch, images.shape[3] // patch)
+        features = self.network.encode(images[None])
+        tokens = [each[0].unflatten(1, grid) for each in features.taps]
+        return (*tokens, features.camera[0], *(each[0] for each in features.stem_maps))
+
+
+class Heads(nn.Module):
+    """Images, tokens and stem maps to depth and confidence (t, h, w) and raw Gaussians (t, g, h, w)."""
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, images: Tensor, *features: Tensor) -> tuple[Tensor, ...]:
+        taps = len(self.network.preset.aggregator.taps)
+        known = Features(
+            taps=tuple(tokens.flatten(1, 2)[None] for tokens in features[:taps]),
+            camera=features[0][None, :, 0, 0],
+            stem_maps=tuple(
+                _cut(maps, images.shape[-2:], halvings=index + 1) for index, maps in enumerate(features[taps:])
+            ),
+        )
+        maps = self.network.dense(known, images[None])
+        assert maps.gaussians is not None
+        return maps.depth[0], maps.confidence[0], maps.gaussians[0]
+
+
+class TokenCameras(nn.Module):
+    """Camera tokens (t, c) to pose encodings (t, 9), for the iterative head."""
+
+    def __init__(self, network: Network) -> None:
+        super().__init__()
+        self.network = network
+
+    def forward(self, camera: Tensor) -> Tensor:
+        known = Features(taps=(), camera=camera[None])
+        return self.network.cameras(known, camera.new_ones(()))[0]
+
+
+class MatchingCameras(nn.Module):
+    """Depth, camera tokens, the last tokens and the last stem map to pose encodings (t, 9), for the matching head.
+
+    Args:
+        network: The network.
+        halvings: How often the image was halved (and rounded up) to the size of the stem map.
+    """
+
+    def __init__(self, network: Network, *, halvings: int) -> None:
+        super().__init__()
+        self.network = network
+        self.halvings = halvings
+
+    def forward(self, depth: Tensor, camera: Tensor, tokens: Tensor, stem: Tensor) -> Tensor:
+        known = Features(
+            taps=(tokens.flatten(1, 2)[None],),
+            camera=camera[None],
+            stem_maps=(_cut(stem, depth.shape[-2:], halvings=self.halvings),),
+        )
+        return self.network.cameras(known, depth[None])[0]
+
+
+def _cut(maps: Tensor, size: Sequence[int], *, halvings: int) -> Tensor:
+    """The stem map, cut to the size it has anyway, which tells the tracer how it depends on the image's."""
+    height, width = size
+    for _ in range(halvings):
+        height, width = (height + 1) // 2, (width + 1) // 2
+    return maps[None, :, :, :height, :width]

@@ -1,0 +1,155 @@
+"""Write a bundle: graphs, weights, model card and a manifest with hashes and parity."""
+
+import shutil
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path, PurePath
+from typing import Any
+
+import onnx
+
+from bathyscope.bundle import (
+    Bundle,
+    BundleManifest,
+    GraphSpec,
+    InputSpec,
+    Role,
+    SceneSpec,
+    hash_file,
+    write_manifest,
+)
+from bathyscope.errors import BundleError
+from bathyscope_export.card import write_card
+from bathyscope_export.graph import export_stage
+from bathyscope_export.parity import SHAPES, compare
+from bathyscope_export.stages import split
+from bathyscope_export.weights import externalise
+from bathyscope_train.model.network import Network
+from bathyscope_train.model.presets import SceneSettings
+
+WEIGHTS = "weights.bin"
+CARD = "card.md"
+
+
+@dataclass(frozen=True, slots=True)
+class BundleSettings:
+    """What a bundle says about itself, besides what its network says."""
+
+    name: str
+    version: str
+    input: InputSpec
+    licence: str = "Apache-2.0"
+    research_only: bool = False
+    training: Mapping[str, Any] = field(default_factory=dict)
+    """How the weights came about; paths in it are cut to their last part."""
+    accuracy: Mapping[str, Any] = field(default_factory=dict)
+    """Measured accuracy, with protocol."""
+    shapes: tuple[tuple[int, int, int], ...] = SHAPES
+    """Clips on which the graphs are compared with PyTorch: frames, rows and columns of patches."""
+
+
+def write_bundle(network: Network, folder: Path, settings: BundleSettings, *, replace: bool = False) -> Bundle:
+    """Export a network into a new folder; written beside and renamed into place.
+
+    Args:
+        network: In evaluation mode, on the CPU, in float32.
+        folder: Where the bundle goes.
+        settings: What it says about itself.
+        replace: Whether a bundle that lies there already may go.
+
+    Raises:
+        BundleError: If the folder exists, the graphs differ from PyTorch, or their attention is quadratic in memory.
+        CheckpointError: If the network has no Gaussian head.
+    """
+    if folder.exists() and not replace:
+        raise BundleError(f"{folder} exists; remove it, choose another name, or replace it")
+    if folder.exists() and not (folder / "bundle.json").is_file():
+        raise BundleError(f"{folder} exists and is no bundle; choose another name")
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    try:
+        beside.chmod(0o755)
+        _fill(network, beside, settings)
+        Bundle.open(beside)
+        if folder.exists():
+            shutil.rmtree(folder)
+        beside.rename(folder)
+    except BaseException:
+        shutil.rmtree(beside, ignore_errors=True)
+        raise
+    return Bundle.open(folder)
+
+
+def _fill(network: Network, folder: Path, settings: BundleSettings) -> None:
+    graphs = write_graphs(network, folder)
+    differences = compare(network, folder, graphs, settings.shapes)
+    for difference in differences:
+        difference.check()
+    parity = [difference.record() for difference in differences]
+    training = strip_paths(dict(settings.training))
+    write_card(folder / CARD, network.preset, settings, training=training, parity=parity)
+    names = [*(graph.file for graph in graphs.values()), WEIGHTS, CARD]
+    manifest = BundleManifest(
+        name=settings.name,
+        version=settings.version,
+        preset=network.preset.name,
+        graphs=graphs,
+        weights=WEIGHTS,
+        files={name: hash_file(folder / name) for name in names},
+        input=settings.input,
+        scene=scene_spec(network.preset.scene, degree=network.preset.harmonic_degree),
+        licence=settings.licence,
+        research_only=settings.research_only,
+        training=training,
+        parity=parity,
+        accuracy=dict(settings.accuracy),
+    )
+    write_manifest(folder, manifest)
+
+
+def write_graphs(network: Network, folder: Path) -> dict[Role, GraphSpec]:
+    """Trace the three stages and write them, with their weights, into ``folder``."""
+    models: dict[Role, onnx.ModelProto] = {}
+    for stage in split(network):
+        models[stage.role] = export_stage(stage, patch=network.preset.patch_size)
+    externalise(models.values(), folder / WEIGHTS)
+    specs: dict[Role, GraphSpec] = {}
+    for role, model in models.items():
+        file = f"{role}.onnx"
+        (folder / file).write_bytes(model.SerializeToString(deterministic=True))
+        specs[role] = GraphSpec(
+            file=file,
+            inputs=tuple(value.name for value in model.graph.input),
+            outputs=tuple(value.name for value in model.graph.output),
+        )
+    return specs
+
+
+def scene_spec(scene: SceneSettings, *, degree: int) -> SceneSpec:
+    """The preset's reading of the raw maps, as the manifest says it.
+
+    Raises:
+        BundleError: If pixels are neither unprojected at their centre nor at their corner.
+    """
+    if scene.pixel_center not in (0.0, 0.5):
+        raise BundleError(f"a bundle unprojects pixels at 0 or 0.5, this preset at {scene.pixel_center}")
+    return SceneSpec(
+        pixel_centre=0.0 if scene.pixel_center == 0.0 else 0.5,
+        focal_epsilon=scene.focal_epsilon,
+        activation=scene.activation,
+        sh_degree=degree,
+        voxel_size=scene.voxel_size,
+        opacity_exponent=scene.opacity_exponent,
+    )
+
+
+def strip_paths(value: Any) -> Any:
+    """The same record with every absolute path cut to its last part: a bundle travels, folders do not."""
+    if isinstance(value, Mapping):
+        return {key: strip_paths(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [strip_paths(each) for each in value]
+    if isinstance(value, str) and PurePath(value).is_absolute():
+        return PurePath(value).name
+    return value
