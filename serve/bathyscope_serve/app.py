@@ -44,7 +44,12 @@ def create_app(engine: Engine, settings: ServiceSettings | None = None) -> FastA
     for module in (depth, status, docs):
         app.include_router(module.router)
     problems.install(app)
-    app.add_middleware(BodyLimits, max_bytes=settings.max_upload_bytes, timeout_s=settings.receive_timeout_s)
+    app.add_middleware(
+        BodyLimits,
+        max_bytes=settings.max_upload_bytes,
+        timeout_s=settings.receive_timeout_s,
+        send_timeout_s=settings.send_timeout_s,
+    )
     app.add_middleware(RequestContext)
     app.openapi = lambda: _openapi(app)  # type: ignore[method-assign]
     return app

@@ -1,4 +1,4 @@
-"""Limits that hold while a request arrives: bytes and time, before any route or parser sees the body."""
+"""Limits that hold while a request arrives and its answer leaves: bytes and time, around every route and parser."""
 
 from __future__ import annotations
 
@@ -15,17 +15,22 @@ from bathyscope_serve.problems import ProblemError, problem_response
 _LINGER_S = 2.0
 
 
+class ClientStalled(Exception):  # noqa: N818 - an event, not a mistake
+    """The client does not read its answer."""
+
+
 class BodyLimits:
-    """ASGI middleware that refuses bodies that are too large or too slow.
+    """ASGI middleware that refuses bodies that are too large or too slow, and gives up on clients that do not read.
 
     The declared length is checked at once; the counted one and the absolute deadline hold for chunked bodies too. The
     refusal is a :class:`~bathyscope_serve.problems.ProblemError` out of ``receive``, so memory stays that of one chunk.
     """
 
-    def __init__(self, app: ASGIApp, *, max_bytes: int, timeout_s: float) -> None:
+    def __init__(self, app: ASGIApp, *, max_bytes: int, timeout_s: float, send_timeout_s: float) -> None:
         self._app = app
         self._max_bytes = max_bytes
         self._timeout_s = timeout_s
+        self._send_timeout_s = send_timeout_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -33,7 +38,7 @@ class BodyLimits:
             return
         body = Body(scope, receive, self._max_bytes, self._timeout_s)
         scope["bathyscope.body"] = body
-        await self._app(scope, body.next, _lingering(body, send))
+        await self._app(scope, body.next, _lingering(body, _within(self._send_timeout_s, send)))
 
 
 class Body:
@@ -96,6 +101,19 @@ class Body:
                     self.complete = not message.get("more_body", False)
         except TimeoutError:
             return
+
+
+def _within(timeout_s: float, send: Send) -> Send:
+    """Break the answer off when the client takes no part of it for so long."""
+
+    async def send_in_time(message: Message) -> None:
+        try:
+            async with asyncio.timeout(timeout_s):
+                await send(message)
+        except TimeoutError as error:
+            raise ClientStalled(f"the client took no part of its answer for {timeout_s:g} s") from error
+
+    return send_in_time
 
 
 def _lingering(body: Body, send: Send) -> Send:

@@ -10,6 +10,7 @@ import uuid
 import structlog
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from bathyscope_serve.body_limits import ClientStalled
 from bathyscope_serve.problems import ProblemError, as_problem, problem_response
 
 _ID = re.compile(rb"[A-Za-z0-9._-]{1,64}")
@@ -53,6 +54,8 @@ class RequestContext:
             if answer.status is None:
                 await problem_response(STOPPING, answer.request_id)(scope, receive, answer.send)
             raise
+        except ClientStalled:
+            notes["problem"] = "answer-broken-off"
         except Exception as error:
             notes["problem"] = as_problem(error).code
             if answer.status is None:

@@ -28,6 +28,9 @@ class ServiceSettings(BaseSettings):
     max_upload_mb: PositiveFloat = Field(default=512, description="Largest body, in MiB.")
     receive_timeout_s: PositiveFloat = Field(default=120, description="Time in which a body must have arrived.")
     header_timeout_s: PositiveFloat = Field(default=10, description="Time in which a request's head must be there.")
+    send_timeout_s: PositiveFloat = Field(
+        default=60, description="Longest wait for a client to take part of an answer."
+    )
     work_timeout_s: PositiveFloat = Field(default=1800, description="Longest estimate of one clip.")
     drain_timeout_s: PositiveFloat = Field(default=30, description="Time for running requests after SIGTERM.")
     temp: Path | None = Field(default=None, description="Folder for bodies and results while a request lasts.")

@@ -111,6 +111,19 @@ def test_a_head_that_trickles_is_cut_at_the_deadline(tmp_path: Path) -> None:
         assert read_all(line) == b""
 
 
+def test_a_client_that_does_not_read_its_answer_is_given_up(tmp_path: Path) -> None:
+    engine = FakeEngine(frames=40, size=(400, 400))
+    app = create_app(engine, ServiceSettings(temp=tmp_path, send_timeout_s=0.3))
+    with live_server(app) as (host, port), socket.socket() as line:
+        line.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        line.connect((host, port))
+        line.sendall(head(4) + b"clip")
+        assert wait_until(lambda: bool(engine.runs) and engine.runs[0].closed)
+        assert wait_until(lambda: not files_below(tmp_path)), "though the connection is still open"
+        with httpx.Client(base_url=f"http://{host}:{port}") as other:
+            assert other.get("/readyz").status_code == 200
+
+
 def test_what_is_no_http_is_a_problem_with_a_request_id_too(tmp_path: Path) -> None:
     app = create_app(FakeEngine(), ServiceSettings(temp=tmp_path))
     with live_server(app) as (host, port), socket.create_connection((host, port)) as line:
