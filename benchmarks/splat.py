@@ -120,7 +120,7 @@ def main() -> None:
     report: dict[str, object] = {"benchmark": "splat", "size": [HEIGHT, WIDTH], "machine": platform.machine()}
     scenes = []
     for frames in (1,) if quick else (1, 3, 16):
-        timings = measure(frames, rounds=2 if quick or frames == 16 else 4)
+        timings = measure(frames, rounds=1 if frames == 16 else 2)
         fast, plain = timings["numba"], timings["numpy"]
         scenes.append(
             {
