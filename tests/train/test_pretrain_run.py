@@ -61,8 +61,7 @@ def test_a_minute_of_training_beats_the_best_constant_map_on_unseen_scenes(clips
     chosen = settings(
         clips,
         tmp_path,
-        steps=80,
-        batch=2,
+        steps=100,
         warmup_steps=10,
         ema_decay=0.9,
         peak_lr=2e-3,

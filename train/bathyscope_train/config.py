@@ -28,6 +28,7 @@ class PretrainSettings(BaseModel, frozen=True, extra="forbid"):
     validation_clips: PositiveInt = Field(default=8, description="Clips taken from each validation folder.")
     out: Path
     initial: Path | None = Field(default=None, description="Checkpoint (safetensors) to start from.")
+    only: str = Field(default="", description="Train only parameters whose names start so, as gaussian_param_head.")
     minutes: PositiveFloat = Field(default=30.0, description="Wall-clock budget; the learning rate follows it.")
     steps: PositiveInt | None = Field(default=None, description="Budget in steps instead: the same bits for a seed.")
     seed: NonNegativeInt = 0

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Int
-from torch import Tensor
+from torch import Tensor, nn
 
 from bathyscope.errors import SettingsError
 from bathyscope_train.config import PretrainSettings
@@ -63,7 +63,7 @@ class _Run:
         self.settings, self.rank = settings, rank
         self.network = initial_network(settings)
         self.average = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
-        self.parameters = list(self.network.parameters())
+        self.parameters = choose_parameters(self.network, settings.only)
         self.optimizer = torch.optim.AdamW(parameter_groups(self.network, settings), betas=(0.9, 0.98))
         self.position = read_state(settings.out, self.network, self.average, self.optimizer)
         self.sources: dict[Path, list[TruthClip]] = {}
@@ -205,10 +205,25 @@ def initial_network(settings: PretrainSettings) -> Network:
     return network
 
 
+def choose_parameters(network: Network, prefix: str) -> list[nn.Parameter]:
+    """The parameters whose names start with ``prefix``; all others are frozen.
+
+    Raises:
+        SettingsError: If there is none.
+    """
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(name.startswith(prefix))
+    chosen = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    if not chosen:
+        raise SettingsError(f"no parameter of {network.preset.name!r} starts with {prefix!r}")
+    return chosen
+
+
 def parameter_groups(network: Network, settings: PretrainSettings) -> list[dict[str, Any]]:
     """Weight decay for matrices and kernels; none for biases, norms and tokens."""
-    decayed = [p for name, p in network.named_parameters() if p.ndim >= 2 and "token" not in name]
-    others = [p for name, p in network.named_parameters() if p.ndim < 2 or "token" in name]
+    trained = [(name, p) for name, p in network.named_parameters() if p.requires_grad]
+    decayed = [p for name, p in trained if p.ndim >= 2 and "token" not in name]
+    others = [p for name, p in trained if p.ndim < 2 or "token" in name]
     return [
         {"params": decayed, "weight_decay": settings.weight_decay, "lr": settings.peak_lr},
         {"params": others, "weight_decay": 0.0, "lr": settings.peak_lr},

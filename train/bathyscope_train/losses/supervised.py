@@ -69,8 +69,9 @@ def supervised_objective(
     }
     if maps.gaussians is not None:
         terms["gaussians"] = gaussian_loss(maps.gaussians, maps.depth.detach(), batch.depth, batch.valid, batch.focal)
-    terms |= _camera_terms(network, features, maps, batch, pairs=(source, target), true_focal=true_focal)
     factors = weights.model_dump()
+    if any(factors[name] > 0 for name in ("focal", "matching", "flow", "motion", "induced_flow")):
+        terms |= _camera_terms(network, features, maps, batch, pairs=(source, target), true_focal=true_focal)
     total = torch.stack([factors[name] * term for name, term in terms.items()]).sum()
     return Objective(total, terms)
 
