@@ -77,7 +77,7 @@ class MatchingEncoder(nn.Module):
         maps = self.refine(maps + F.interpolate(coarse, size=size, mode="bilinear", align_corners=False))
         context = F.gelu(self.context(maps[..., ::QUERY_STEP, ::QUERY_STEP]))
         descriptors = self.descriptor(maps)
-        length = (descriptors.square().sum(1, keepdim=True) + 1e-8).sqrt()
+        length = (descriptors.square().sum(1, keepdim=True) + 1e-7).sqrt()
         return MatchingFeatures((descriptors / length).unflatten(0, (b, t)), context.unflatten(0, (b, t)))
 
 

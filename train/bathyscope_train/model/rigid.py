@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-_EPSILON = 1e-8
+_EPSILON = 1e-7  # ONNX graph optimisers take an addition of 1e-8 for one of nothing and drop it
 
 
 def cross_matrix(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
@@ -22,7 +22,7 @@ def cross_matrix(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 def rotation_exponential(angles: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Rotation about ``angles`` by its length, in radians (Rodrigues).
 
-    The squared length gets 1e-8 added, which keeps the gradient finite at zero and costs less than 1e-8
+    The squared length gets 1e-7 added, which keeps the gradient finite at zero and costs less than 1e-7
     in the result.
     """
     theta = (angles.square().sum(-1, keepdim=True) + _EPSILON).sqrt()[..., None]
