@@ -52,8 +52,12 @@ def export(  # noqa: PLR0917 - typer: one parameter an option
             research_only=research_only,
             training=training_of(checkpoint),
         )
-        written = write_bundle(network, bundle, settings, replace=replace)
+        written = write_bundle(network, bundle, settings, replace=replace, progress=_say)
     except BathyscopeError as error:
         typer.echo(f"bathyscope export: {error}", err=True)
         raise typer.Exit(_WRONG_USAGE) from error
     typer.echo(written.folder)
+
+
+def _say(message: str) -> None:
+    typer.echo(f"bathyscope export: {message}", err=True)

@@ -2,7 +2,7 @@
 
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
@@ -49,7 +49,14 @@ class BundleSettings:
     """Clips on which the graphs are compared with PyTorch: frames, rows and columns of patches."""
 
 
-def write_bundle(network: Network, folder: Path, settings: BundleSettings, *, replace: bool = False) -> Bundle:
+def write_bundle(
+    network: Network,
+    folder: Path,
+    settings: BundleSettings,
+    *,
+    replace: bool = False,
+    progress: Callable[[str], None] = lambda message: None,
+) -> Bundle:
     """Export a network into a new folder; written beside and renamed into place.
 
     Args:
@@ -57,6 +64,7 @@ def write_bundle(network: Network, folder: Path, settings: BundleSettings, *, re
         folder: Where the bundle goes.
         settings: What it says about itself.
         replace: Whether a bundle that lies there already may go.
+        progress: Told what is being done; the whole takes minutes.
 
     Raises:
         BundleError: If the folder exists, the graphs differ from PyTorch, or their attention is quadratic in memory.
@@ -70,7 +78,7 @@ def write_bundle(network: Network, folder: Path, settings: BundleSettings, *, re
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         beside.chmod(0o755)
-        _fill(network, beside, settings)
+        _fill(network, beside, settings, progress)
         Bundle.open(beside)
         if folder.exists():
             shutil.rmtree(folder)
@@ -81,8 +89,9 @@ def write_bundle(network: Network, folder: Path, settings: BundleSettings, *, re
     return Bundle.open(folder)
 
 
-def _fill(network: Network, folder: Path, settings: BundleSettings) -> None:
-    graphs = write_graphs(network, folder)
+def _fill(network: Network, folder: Path, settings: BundleSettings, progress: Callable[[str], None]) -> None:
+    graphs = write_graphs(network, folder, progress)
+    progress(f"comparing with PyTorch on {len(settings.shapes)} clips")
     differences = compare(network, folder, graphs, settings.shapes)
     for difference in differences:
         difference.check()
@@ -108,10 +117,13 @@ def _fill(network: Network, folder: Path, settings: BundleSettings) -> None:
     write_manifest(folder, manifest)
 
 
-def write_graphs(network: Network, folder: Path) -> dict[Role, GraphSpec]:
+def write_graphs(
+    network: Network, folder: Path, progress: Callable[[str], None] = lambda message: None
+) -> dict[Role, GraphSpec]:
     """Trace the three stages and write them, with their weights, into ``folder``."""
     models: dict[Role, onnx.ModelProto] = {}
     for stage in split(network):
+        progress(f"tracing {stage.role}")
         models[stage.role] = export_stage(stage, patch=network.preset.patch_size)
     externalise(models.values(), folder / WEIGHTS)
     specs: dict[Role, GraphSpec] = {}
