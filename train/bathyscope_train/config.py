@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import yaml
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError, model_validator
@@ -34,8 +34,8 @@ class PretrainSettings(BaseModel, frozen=True, extra="forbid"):
     seed: NonNegativeInt = 0
     workers: PositiveInt = Field(default=1, description="Processes that each take a share of every batch.")
     threads: PositiveInt = Field(default=1, description="Threads of each process.")
-    precision: str = Field(
-        default="float32", pattern="^(float32|bfloat16|auto)$", description="Of the transformer; auto asks the CPU."
+    precision: Literal["float32", "bfloat16", "auto"] = Field(
+        default="float32", description="Of the transformer; auto asks the CPU."
     )
     batch: PositiveInt = Field(default=2, description="Windows a step, over all workers.")
     frames: PositiveInt = Field(default=8, description="Frames of a window.")

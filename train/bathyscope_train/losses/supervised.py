@@ -102,7 +102,7 @@ def _camera_terms(
     return {
         "focal": focal_loss(focal, batch.focal),
         "matching": matching_cross_entropy(estimates.correlation, true, estimates.principal),
-        "flow": sum((flow_loss(each.matches, true) for each in estimates.rounds), torch.zeros(())),
+        "flow": torch.stack([flow_loss(each.matches, true) for each in estimates.rounds]).sum(),
         "motion": 0.5 * motion_loss(first.solution.motion, true.motion)
         + motion_loss(last.solution.motion, true.motion),
         "induced_flow": induced_flow_loss(last.solution.motion, true),
