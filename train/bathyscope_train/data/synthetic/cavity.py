@@ -23,7 +23,7 @@ def cavity(random: np.random.Generator, material: MaterialRanges) -> Scene:
     ground = extent * random.uniform(0.3, 0.5)
     tilt = random.uniform(-0.3, 0.3, 2)
     waves = periodic_noise(random, (_SAMPLES, _SAMPLES), (step, step), grain_mm=extent / 6)
-    heights = np.float32(ground + tilt[0] * x + tilt[1] * y + 0.02 * extent * waves)
+    heights = np.asarray(ground + tilt[0] * x + tilt[1] * y + 0.02 * extent * waves, np.float32)
 
     tint = material.variety[0] + (material.variety[1] - material.variety[0]) * random.uniform()
     base = palette(random, material)
@@ -31,14 +31,14 @@ def cavity(random: np.random.Generator, material: MaterialRanges) -> Scene:
     for _ in range(int(random.integers(4, 12))):
         organ = _organ(random, x, y, heights, extent)
         wins = organ < heights
-        colour = blend(base, palette(random, material), np.float32(min(1.0, 2.5 * tint)))
+        colour = blend(base, palette(random, material), np.asarray(min(1.0, 2.5 * tint), np.float32))
         albedo[wins] = colour
         heights = np.minimum(heights, organ)
     folds = periodic_noise(random, (_SAMPLES, _SAMPLES), (step, step), grain_mm=extent / 24)
     heights += np.float32(0.0017 * extent * folds)
     heights -= _wall(random, x, y, extent)
-    heights = cv2.GaussianBlur(heights, (0, 0), 1.4, borderType=cv2.BORDER_REPLICATE)
-    albedo = cv2.GaussianBlur(albedo, (0, 0), 1.2)
+    heights = np.asarray(cv2.GaussianBlur(heights, (0, 0), 1.4, borderType=cv2.BORDER_REPLICATE), np.float32)
+    albedo = np.asarray(cv2.GaussianBlur(albedo, (0, 0), 1.2), np.float32)
     surface = make_surface(
         FIELD,
         heights,
@@ -48,7 +48,7 @@ def cavity(random: np.random.Generator, material: MaterialRanges) -> Scene:
         feature_mm=0.03 * extent,
     )
     tissue = make_tissue(
-        random, material, np.float32(albedo), (extent, extent), wrap=False, vessel_step_mm=0.3, grain=1.6
+        random, material, np.asarray(albedo, np.float32), (extent, extent), wrap=False, vessel_step_mm=0.3, grain=1.6
     )
     return Scene("cavity", surface, tissue)
 
@@ -64,7 +64,7 @@ def _organ(random: np.random.Generator, x: Array, y: Array, ground: Array, exten
     foot = float(np.median(ground))
     height = random.uniform(0.5, 1.3) * float(size.min())
     top = foot + 0.2 * height - height * np.sqrt(np.clip(inside, 0.0, 1.0)) - random.uniform(0.0, 0.06) * extent
-    return np.float32(np.where(inside > 0, top, np.inf))
+    return np.asarray(np.where(inside > 0, top, np.inf), np.float32)
 
 
 def _wall(random: np.random.Generator, x: Array, y: Array, extent: float) -> Array:
@@ -73,4 +73,4 @@ def _wall(random: np.random.Generator, x: Array, y: Array, extent: float) -> Arr
     radius = np.sqrt((x * stretch) ** 2 + (y / stretch) ** 2) / extent
     beyond = np.clip((radius - random.uniform(0.3, 0.36)) / 0.14, 0.0, None)
     border = np.clip((np.maximum(np.abs(x), np.abs(y)) / extent - 0.38) / 0.08, 0.0, None)
-    return np.float32(0.75 * extent * np.maximum(beyond, border) ** 1.8)
+    return np.asarray(0.75 * extent * np.maximum(beyond, border) ** 1.8, np.float32)

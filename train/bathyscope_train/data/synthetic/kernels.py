@@ -89,7 +89,8 @@ def _free(surface: Surface, row: float, column: float, reach: float) -> float:
     heights = surface.heights
     above = (1 - t) * heights[i, j] + t * heights[i, k]
     below = (1 - t) * heights[i + 1, j] + t * heights[i + 1, k]
-    return (1 - s) * above + s * below - reach
+    gap: float = (1 - s) * above + s * below - reach
+    return gap
 
 
 @_jit
@@ -173,7 +174,8 @@ def _vessel(tissue: Tissue, row: float, column: float, footprint: float, wrap: b
         k = j + 1
     above = (1 - t) * density[i, j] + t * density[i, k]
     below = (1 - t) * density[i + 1, j] + t * density[i + 1, k]
-    return (1 - s) * above + s * below
+    mixed: float = (1 - s) * above + s * below
+    return mixed
 
 
 @_jit

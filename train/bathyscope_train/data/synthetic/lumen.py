@@ -21,7 +21,7 @@ def diamond_angles(columns: int) -> Array:
     marcher one division where the true angle costs an arc tangent.
     """
     quarter, rest = np.divmod(np.arange(columns) * 4.0 / columns, 1.0)
-    return np.float32(quarter * np.pi / 2 + np.arctan2(rest, 1.0 - rest))
+    return np.asarray(quarter * np.pi / 2 + np.arctan2(rest, 1.0 - rest), np.float32)
 
 
 def centreline(random: np.random.Generator, z: Array, bend: float, wavelengths: tuple[float, float]) -> Array:
@@ -32,25 +32,27 @@ def centreline(random: np.random.Generator, z: Array, bend: float, wavelengths: 
             wave = 2 * np.pi / random.uniform(*wavelengths)
             phase = random.uniform(0, 2 * np.pi)
             line[:, axis] += random.uniform(0, bend / 2) / wave * (np.sin(wave * z + phase) - np.sin(phase))
-    return np.float32(line)
+    return np.asarray(line, np.float32)
 
 
 def _taper(z: Array, cap_mm: float) -> Array:
     """Round ends: 1 along the tube, 0 at both ends, ``(rows, 1)``."""
     inside = np.minimum(z - z[0], z[-1] - z) / cap_mm
-    return np.float32(np.sqrt(1.0 - np.clip(1.0 - inside, 0.0, 1.0) ** 2))[:, None]
+    return np.asarray(np.sqrt(1.0 - np.clip(1.0 - inside, 0.0, 1.0) ** 2), np.float32)[:, None]
 
 
 def _angular(theta: Array, centre: float) -> Array:
     """Signed difference to ``centre``, in (-pi, pi]."""
-    return np.float32((theta - centre + np.pi) % (2 * np.pi) - np.pi)
+    return np.asarray((theta - centre + np.pi) % (2 * np.pi) - np.pi, np.float32)
 
 
-def _smooth(heights: Array, samples: float) -> Array:
+def _smooth(heights: npt.NDArray[np.floating], samples: float) -> Array:
     """Blur a radius map, round its ring too, so that no step is steeper than the map resolves."""
     edge = 8
     padded = cv2.copyMakeBorder(heights, 0, 0, edge, edge, cv2.BORDER_WRAP)
-    return np.float32(cv2.GaussianBlur(padded, (0, 0), samples, borderType=cv2.BORDER_REPLICATE)[:, edge:-edge])
+    return np.asarray(
+        cv2.GaussianBlur(padded, (0, 0), samples, borderType=cv2.BORDER_REPLICATE)[:, edge:-edge], np.float32
+    )
 
 
 def colon(random: np.random.Generator, material: MaterialRanges) -> Scene:
@@ -119,7 +121,7 @@ def _polyp(random: np.random.Generator, z: Array, theta: Array, radius: float) -
     along = (z - random.uniform(10.0, z[-1] - 10.0))[:, None] / size
     across = _angular(theta, random.uniform(0, 2 * np.pi)) * (radius - 0.6 * height) / size
     inside = np.clip(1.0 - along**2 - across**2, 0.0, 1.0)
-    return np.float32(height * inside**0.45), np.float32(np.clip(3 * inside, 0, 1))
+    return np.asarray(height * inside**0.45, np.float32), np.asarray(np.clip(3 * inside, 0, 1), np.float32)
 
 
 def sinus(random: np.random.Generator, material: MaterialRanges) -> Scene:

@@ -13,7 +13,10 @@ def _wavenumbers(shape: tuple[int, ...], step_mm: tuple[float, ...]) -> list[Arr
         (np.fft.rfftfreq if axis == last else np.fft.fftfreq)(n, step)
         for axis, (n, step) in enumerate(zip(shape, step_mm, strict=True))
     ]
-    return [np.float32(k).reshape([-1 if i == axis else 1 for i in range(last + 1)]) for axis, k in enumerate(axes)]
+    return [
+        np.asarray(k, np.float32).reshape([-1 if i == axis else 1 for i in range(last + 1)])
+        for axis, k in enumerate(axes)
+    ]
 
 
 def _band(wavenumbers: list[Array], grain_mm: float, slope: float) -> Array:
@@ -21,7 +24,7 @@ def _band(wavenumbers: list[Array], grain_mm: float, slope: float) -> Array:
     radius = np.sqrt(np.sum(np.stack(np.broadcast_arrays(*[k**2 for k in wavenumbers])), axis=0)) * grain_mm
     band = (1.0 + radius**2) ** (-slope / 2)
     band[(0,) * band.ndim] = 0.0
-    return np.float32(band)
+    return np.asarray(band, np.float32)
 
 
 def periodic_noise(
@@ -38,7 +41,7 @@ def periodic_noise(
     """
     white = np.fft.rfftn(random.standard_normal(shape, dtype=np.float32))
     noise = np.fft.irfftn(white * _band(_wavenumbers(shape, step_mm), grain_mm, slope), s=shape, axes=range(len(shape)))
-    return np.float32(noise / (noise.std() + 1e-12))
+    return np.asarray(noise / (noise.std() + 1e-12), np.float32)
 
 
 def gradient_noise(
@@ -49,4 +52,4 @@ def gradient_noise(
     white = np.fft.rfftn(random.standard_normal(shape, dtype=np.float32)) * _band(wavenumbers, grain_mm, 6.0)
     axes = range(len(shape))
     slopes = np.stack([np.fft.irfftn(2j * np.pi * k * white, s=shape, axes=axes) for k in wavenumbers], axis=-1)
-    return np.float32(slopes / (np.sqrt((slopes**2).sum(-1).mean()) + 1e-12))
+    return np.asarray(slopes / (np.sqrt((slopes**2).sum(-1).mean()) + 1e-12), np.float32)

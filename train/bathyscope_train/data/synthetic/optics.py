@@ -63,7 +63,7 @@ def _field_of_view(random: np.random.Generator, size: tuple[int, int]) -> Array:
         outside = np.hypot(x, y) - random.uniform(0.72, 1.08)
     else:
         outside = np.abs(x) + np.abs(y) - random.uniform(1.35, 1.7)
-    return np.float32(np.clip(0.5 - outside / edge, 0.0, 1.0))
+    return np.asarray(np.clip(0.5 - outside / edge, 0.0, 1.0), np.float32)
 
 
 def gains(radiance: Array, sensor: Sensor) -> npt.NDArray[np.float64]:
@@ -108,4 +108,6 @@ def develop(random: np.random.Generator, radiance: Array, sensor: Sensor) -> npt
 
 def _compress(frame: npt.NDArray[np.uint8], quality: int) -> npt.NDArray[np.uint8]:
     coded = cv2.imencode(".jpg", frame[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
-    return np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR)[..., ::-1], np.uint8)
+    decoded = cv2.imdecode(coded, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return np.asarray(decoded[..., ::-1], np.uint8)

@@ -73,7 +73,7 @@ class Scene(NamedTuple):
 
 def make_surface(
     kind: int,
-    heights: Array,
+    heights: npt.NDArray[np.floating],
     *,
     first: tuple[float, float],
     step: tuple[float, float],

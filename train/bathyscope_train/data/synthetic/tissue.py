@@ -25,7 +25,7 @@ def palette(random: np.random.Generator, material: MaterialRanges) -> Array:
 def blend(base: Array, other: Array, share: Array | float) -> Array:
     """Mix two colours geometrically, which keeps red >= green >= blue where both have it."""
     weight = np.asarray(share, np.float32)[..., None]
-    return np.float32(np.exp((1 - weight) * np.log(base) + weight * np.log(other)))
+    return np.asarray(np.exp((1 - weight) * np.log(base) + weight * np.log(other)), np.float32)
 
 
 def solid_grain(random: np.random.Generator) -> Array:

@@ -40,7 +40,7 @@ def vessel_map(
             step_mm=step_mm,
             wrap=wrap,
         )
-    return np.float32(cv2.GaussianBlur(canvas, (0, 0), 0.7)) / np.float32(255)
+    return np.asarray(np.asarray(cv2.GaussianBlur(canvas, (0, 0), 0.7), np.float32) / np.float32(255), np.float32)
 
 
 def _grow(
