@@ -12,6 +12,9 @@ from bathyscope.errors import BundleError
 FUSED = "MultiHeadAttention"
 FUSED_DOMAIN = "com.microsoft"
 
+MOST_UNKNOWN = 0.05
+"""Share of values that may lack a shape."""
+
 
 def check_linear_attention(model: onnx.ModelProto, role: Role) -> None:
     """Refuse a graph that materialises attention weights.
@@ -21,14 +24,26 @@ def check_linear_attention(model: onnx.ModelProto, role: Role) -> None:
         role: Named in the error.
 
     Raises:
-        BundleError: If a fused node has more than queries, keys and values, or a value has two equal dynamic last axes.
+        BundleError: If a fused node has more than queries, keys and values, a value has two equal dynamic last axes,
+            or too few shapes are known to tell.
     """
     for node in model.graph.node:
         if node.op_type == FUSED and len([name for name in node.input if name]) != 3:
             raise BundleError(f"{role}: {FUSED} reads {list(node.input)}; a mask or bias makes it quadratic")
+    unknown = unknown_share(model)
+    if unknown > MOST_UNKNOWN:
+        raise BundleError(f"{role}: {unknown:.0%} of the values have no known shape; the check needs shape inference")
     squares = square_values(model)
     if squares:
         raise BundleError(f"{role}: {squares[0]} has shape (..., S, S); attention must go through one fused node")
+
+
+def unknown_share(model: onnx.ModelProto) -> float:
+    """Share of the nodes' outputs whose shape the graph does not tell."""
+    values = (*model.graph.value_info, *model.graph.output)
+    told = {value.name for value in values if value.type.tensor_type.HasField("shape")}
+    made = [name for node in model.graph.node for name in node.output if name]
+    return sum(name not in told for name in made) / max(len(made), 1)
 
 
 def square_values(model: onnx.ModelProto) -> list[str]:

@@ -254,6 +254,7 @@ def test_decomposed_attention_is_refused() -> None:
             "g",
             [tokens],
             [scores],
+            value_info=[helper.make_tensor_value_info("y", TensorProto.FLOAT, ["frames", 8, "tokens"])],
         )
     )
     with pytest.raises(BundleError, match=r"backbone: scores has shape \(\.\.\., S, S\)"):
@@ -265,6 +266,14 @@ def test_fused_attention_with_a_mask_is_refused() -> None:
     model = helper.make_model(helper.make_graph([node], "g", [], []))
     with pytest.raises(BundleError, match="a mask or bias makes it quadratic"):
         check_linear_attention(model, "backbone")
+
+
+def test_a_graph_without_shapes_cannot_be_checked() -> None:
+    nodes = [helper.make_node("Relu", [name], [after]) for name, after in ("xa", "ab", "by")]
+    output = helper.make_tensor_value_info("y", TensorProto.FLOAT, ["frames", 3])
+    model = helper.make_model(helper.make_graph(nodes, "g", [], [output]))
+    with pytest.raises(BundleError, match="67% of the values have no known shape"):
+        check_linear_attention(model, "heads")
 
 
 def test_equal_tensors_of_several_graphs_are_stored_once(tmp_path: Path) -> None:
