@@ -1,7 +1,8 @@
 """``bathyscope export CHECKPOINT BUNDLE``: turn a checkpoint into a bundle."""
 
+import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -25,6 +26,10 @@ def export(  # noqa: PLR0917 - typer: one parameter an option
     research_only: Annotated[
         bool, typer.Option("--research-only", help="The weights may not be used otherwise.")
     ] = False,
+    accuracy: Annotated[
+        Path | None,
+        typer.Option(exists=True, dir_okay=False, help="JSON object with measured accuracy, for the manifest."),
+    ] = None,
     replace: Annotated[bool, typer.Option("--replace", help="Replace a bundle that lies there already.")] = False,
 ) -> None:
     """Turn a checkpoint into a bundle: ONNX graphs, one weights file, a manifest with hashes and parity.
@@ -51,12 +56,23 @@ def export(  # noqa: PLR0917 - typer: one parameter an option
             licence=licence,
             research_only=research_only,
             training=training_of(checkpoint),
+            accuracy={} if accuracy is None else _read_accuracy(accuracy),
         )
         written = write_bundle(network, bundle, settings, replace=replace, progress=_say)
     except BathyscopeError as error:
         typer.echo(f"bathyscope export: {error}", err=True)
         raise typer.Exit(_WRONG_USAGE) from error
     typer.echo(written.folder)
+
+
+def _read_accuracy(path: Path) -> dict[str, Any]:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise typer.BadParameter(f"{path} is not JSON ({error})") from error
+    if not isinstance(record, dict):
+        raise typer.BadParameter(f"{path} holds a {type(record).__name__}, a JSON object was needed")
+    return record
 
 
 def _say(message: str) -> None:

@@ -314,4 +314,8 @@ def test_command_says_what_is_wrong_and_writes_nothing(tmp_path: Path) -> None:
     save_checkpoint(random_network(), tmp_path / "own")
     result = CliRunner().invoke(app, [str(tmp_path / "own"), str(tmp_path / "bundle"), "--overlap", "8"])
     assert result.exit_code == 2
+    (tmp_path / "list.json").write_text("[1]")
+    accuracy = ["--accuracy", str(tmp_path / "list.json")]
+    result = CliRunner().invoke(app, [str(tmp_path / "own"), str(tmp_path / "bundle"), *accuracy])
+    assert (result.exit_code, "a JSON object was needed" in result.stderr.replace("\n", " ")) == (2, True)
     assert not (tmp_path / "bundle").exists()
