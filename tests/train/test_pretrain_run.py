@@ -26,7 +26,7 @@ from bathyscope_train.model.presets import (
     NetworkPreset,
     VitSettings,
 )
-from bathyscope_train.pretrain import METRICS_FILE, WEIGHTS_FILE, draw_pairs, pretrain, use_bfloat16
+from bathyscope_train.pretrain import METRICS_FILE, WEIGHTS_FILE, draw_pairs, pretrain, training_record, use_bfloat16
 from bathyscope_train.schedule import ema_decay, learning_rate_factor, source_shares
 from bathyscope_train.training_state import STATE_FILE
 from bathyscope_train.validation import validate
@@ -102,6 +102,15 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
     assert torch.load(tmp_path / "parts" / STATE_FILE, weights_only=True)["step"] == 2
     parts = load_file(pretrain(chosen))
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
+
+
+def test_the_weights_say_how_they_were_made_but_not_on_whose_machine(clips: Path, tmp_path: Path) -> None:
+    chosen = settings(clips, tmp_path, initial=tmp_path / "first.safetensors", validation=(clips / "held_out",))
+    record = training_record(chosen)
+    assert record["data"][0]["folder"] == "train"
+    assert (record["initial"], record["validation"]) == ("first.safetensors", ["held_out"])
+    assert (record["steps"], record["loss"]["motion"]) == (2, 1.0)
+    assert str(tmp_path.parent) not in json.dumps(record)
 
 
 def test_a_run_can_start_from_the_weights_of_another(clips: Path, tmp_path: Path) -> None:

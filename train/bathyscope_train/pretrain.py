@@ -179,7 +179,7 @@ class _Run:
     def save(self) -> None:
         """Write weights and state."""
         self.position.elapsed_s = time.monotonic() - self.started
-        training = {"step": self.position.step, "settings": json.loads(self.settings.model_dump_json())}
+        training = {"step": self.position.step, "settings": training_record(self.settings)}
         save_checkpoint(self.averaged(), self.settings.out / WEIGHTS_FILE, training=training)
         write_state(self.settings.out, self.network, self.average, self.optimizer, self.position)
 
@@ -203,6 +203,16 @@ def initial_network(settings: PretrainSettings) -> Network:
             f"preset {network.preset.name!r} has no matching camera head; pre-training needs one, as in 'tiny'"
         )
     return network
+
+
+def training_record(settings: PretrainSettings) -> dict[str, Any]:
+    """What a checkpoint says about its making: the settings, with the names of folders but not where they lay."""
+    record: dict[str, Any] = json.loads(settings.model_dump_json(exclude={"out"}))
+    for source in record["data"]:
+        source["folder"] = Path(source["folder"]).name
+    record["validation"] = [Path(folder).name for folder in record["validation"]]
+    record["initial"] = Path(record["initial"]).name if record["initial"] else None
+    return record
 
 
 def choose_parameters(network: Network, prefix: str) -> list[nn.Parameter]:
