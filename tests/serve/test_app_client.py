@@ -1,6 +1,7 @@
 """Service and client together, over a real socket."""
 
 import json
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,6 +26,9 @@ def url(tmp_path: Path) -> Iterator[str]:
     with live_server(create_app(FakeEngine(), ServiceSettings(temp=folder))) as (host, port):
         yield f"http://{host}:{port}"
         (root,) = folder.iterdir()
+        deadline = time.monotonic() + 10
+        while list(root.iterdir()) and time.monotonic() < deadline:
+            time.sleep(0.01)  # a request's folder goes after its answer has been sent
         assert list(root.iterdir()) == []
 
 
