@@ -39,7 +39,7 @@ class EngineSettings(BaseModel, frozen=True, extra="forbid"):
     overlap: PositiveInt | None = Field(default=None, description="Shared frames; the bundle's unless given.")
     pixels: PositiveInt | None = Field(default=None, description="Area the network sees; the bundle's unless given.")
     least_opacity: NonNegativeFloat = Field(
-        default=0.1, le=1.0, description="Rendered depth below this opacity is replaced by the depth head's."
+        default=0.3, le=1.0, description="Rendered depth below this opacity is replaced by the depth head's."
     )
     stitch: StitchSettings = StitchSettings()
     cuts: CutSettings = CutSettings()

@@ -46,7 +46,7 @@ def render_window(
     *,
     inside: NDArray[np.bool_],
     rendered: bool = True,
-    least_opacity: float = 0.1,
+    least_opacity: float = 0.3,
     run: Map = map,
 ) -> list[View]:
     """Depth, confidence and cameras of a window's frames.
