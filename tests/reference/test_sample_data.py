@@ -14,7 +14,7 @@ from bathyscope_train.evaluation.folders import DatasetFolder
 
 DATA = Path(os.environ.get("BATHYSCOPE_DATA", Path(__file__).parents[2] / "../shared/data"))
 AGREEMENT = {"colon_phantom_a": 0.02, "colon_phantom_b": 0.03, "colon_rendered_a": 0.03}
-"""Median relative difference between a depth carried to the next frame and the depth there; README.md of the data."""
+"""The data set's own README says 1.2, 1.6 and 1.8 %, the median over the pairs of neighbouring frames."""
 
 
 def sample(name: str) -> DatasetFolder:
@@ -34,20 +34,27 @@ def depth_map(folder: DatasetFolder, index: int) -> np.ndarray:
     return depth
 
 
-@pytest.mark.parametrize("name", AGREEMENT)
-def test_depth_carried_to_the_next_frame_by_the_poses_is_the_depth_there(name: str) -> None:
-    folder = sample(name)
+def disagreement(folder: DatasetFolder, index: int) -> float:
+    """Median relative difference between the depth of a frame carried to the next and the depth there."""
     k = matrix(folder.calibration)
-    source, target = depth_map(folder, 0), depth_map(folder, 1)
-    points = unproject(source, k, folder.world_from_camera[0])[source > 0]
-    pixels, expected = project(points, k, folder.world_from_camera[1])
+    source, target = depth_map(folder, index), depth_map(folder, index + 1)
+    points = unproject(source, k, folder.world_from_camera[index])[source > 0]
+    pixels, expected = project(points, k, folder.world_from_camera[index + 1])
     h, w = folder.calibration.size
     inside = (expected > 0) & ((pixels > 0) & (pixels < (w, h))).all(axis=1)
     columns, rows = pixels[inside].astype(int).T
     observed, expected = target[rows, columns], expected[inside]
     both = observed > 0
-    assert both.sum() > 0.3 * source.size
-    assert np.median(np.abs(observed - expected)[both] / observed[both]) < AGREEMENT[name]
+    assert both.sum() > 0.1 * source.size
+    return float(np.median(np.abs(observed - expected)[both] / observed[both]))
+
+
+@pytest.mark.parametrize("name", AGREEMENT)
+def test_depth_carried_to_the_next_frame_by_the_poses_is_the_depth_there(name: str) -> None:
+    """Over all pairs: single ones differ by up to 14 %, as the data set says itself."""
+    folder = sample(name)
+    pairs = [disagreement(folder, index) for index in range(len(folder.frames) - 1)]
+    assert np.median(pairs) < AGREEMENT[name]
 
 
 def test_sparse_points_keep_the_observations_that_optical_flow_confirms() -> None:
