@@ -6,9 +6,10 @@ import numpy.typing as npt
 import pytest
 
 from bathyscope_train.data.synthetic import DOMAINS, SyntheticClip, render_clip
-from bathyscope_train.data.synthetic.kernels import Lamp, render
+from bathyscope_train.data.synthetic.kernels import render
 from bathyscope_train.data.synthetic.noise import gradient_noise, periodic_noise
 from bathyscope_train.data.synthetic.scene import FIELD, TUBE, Scene, Surface, make_surface
+from bathyscope_train.data.synthetic.shading import Lamp
 from bathyscope_train.data.synthetic.tissue import make_tissue
 
 SIZE = (56, 70)

@@ -9,11 +9,12 @@ import numpy.typing as npt
 from bathyscope.errors import SettingsError
 from bathyscope_train.data.synthetic.cavity import cavity
 from bathyscope_train.data.synthetic.domain import Domain, LightRanges, choose, draw
-from bathyscope_train.data.synthetic.kernels import Lamp, render
+from bathyscope_train.data.synthetic.kernels import render
 from bathyscope_train.data.synthetic.lumen import colon, sinus
-from bathyscope_train.data.synthetic.optics import develop, draw_sensor
+from bathyscope_train.data.synthetic.optics import Sensor, develop, draw_sensor
 from bathyscope_train.data.synthetic.path import camera_path
 from bathyscope_train.data.synthetic.scene import Scene
+from bathyscope_train.data.synthetic.shading import Lamp
 
 _BUILDERS = {"lumen": colon, "cavity": cavity, "sinus": sinus}
 
@@ -37,10 +38,50 @@ class SyntheticClip:
     domain: str
 
 
+@dataclass(frozen=True, slots=True)
+class ClipPlan:
+    """All that decides a clip's radiance, depth and development but the noise: what every renderer starts from."""
+
+    scene: Scene
+    lamp: Lamp
+    sensor: Sensor
+    scene_from_camera: npt.NDArray[np.float64]
+    """``(t, 4, 4)``, OpenCV axes."""
+    intrinsics: npt.NDArray[np.float64]
+    size: tuple[int, int]
+    name: str
+
+
 def draw_scene(seed: int, domain: Domain) -> Scene:
     """The scene that ``render_clip`` films for this seed."""
     random = _stream(seed, domain, "scene")
     return _BUILDERS[choose(random, domain.families)](random, domain.material)
+
+
+def plan_clip(seed: int, domain: Domain, *, frames: int = 16, size: tuple[int, int] = (112, 140)) -> ClipPlan:
+    """Draw everything about a clip but its noise; the same for the same arguments.
+
+    Raises:
+        SettingsError: If seed, length or size cannot be used.
+    """
+    if seed < 0 or frames < 1 or min(size) < 8:
+        raise SettingsError(
+            f"a clip needs a seed >= 0, at least 1 frame and 8 x 8 pixels; got seed {seed}, {frames} frames, {size}"
+        )
+    scene = draw_scene(seed, domain)
+    random = _stream(seed, domain, "camera")
+    fov_deg = _view_angle(random, domain.camera.fov_deg)
+    poses = camera_path(random, scene, domain.camera, fov_deg, frames)
+    random = _stream(seed, domain, "light")
+    return ClipPlan(
+        scene=scene,
+        lamp=_lamp(random, domain.light, scene),
+        sensor=draw_sensor(random, domain.sensor, size),
+        scene_from_camera=poses,
+        intrinsics=_intrinsics(fov_deg, size),
+        size=size,
+        name=f"{domain.name}-{scene.family}-{seed:06d}",
+    )
 
 
 def render_clip(seed: int, domain: Domain, *, frames: int = 16, size: tuple[int, int] = (112, 140)) -> SyntheticClip:
@@ -57,35 +98,30 @@ def render_clip(seed: int, domain: Domain, *, frames: int = 16, size: tuple[int,
     Raises:
         SettingsError: If seed, length or size cannot be used.
     """
-    if seed < 0 or frames < 1 or min(size) < 8:
-        raise SettingsError(
-            f"a clip needs a seed >= 0, at least 1 frame and 8 x 8 pixels; got seed {seed}, {frames} frames, {size}"
-        )
-    scene = draw_scene(seed, domain)
-    random = _stream(seed, domain, "camera")
-    fov_deg = _view_angle(random, domain.camera.fov_deg)
-    poses = camera_path(random, scene, domain.camera, fov_deg, frames)
-    intrinsics = _intrinsics(fov_deg, size)
-
-    random = _stream(seed, domain, "light")
-    lamp = _lamp(random, domain.light, scene)
-    sensor = draw_sensor(random, domain.sensor, size)
+    plan = plan_clip(seed, domain, frames=frames, size=size)
     radiance, depth = np.empty((frames, *size, 3), np.float32), np.empty((frames, *size), np.float32)
-    for index, pose in enumerate(poses):
-        radiance[index], depth[index] = render(scene.surface, scene.tissue, lamp, pose, intrinsics, size)
-    valid = (sensor.view >= 0.5) & (depth > 0)
-    world_from_camera = np.linalg.inv(poses[0]) @ poses
-    world_from_camera[0] = np.eye(4)
+    for index, pose in enumerate(plan.scene_from_camera):
+        radiance[index], depth[index] = render(
+            plan.scene.surface, plan.scene.tissue, plan.lamp, pose, plan.intrinsics, size
+        )
+    valid = (plan.sensor.view >= 0.5) & (depth > 0)
     return SyntheticClip(
-        frames=develop(_stream(seed, domain, "noise"), radiance, sensor),
+        frames=develop(_stream(seed, domain, "noise"), radiance, plan.sensor),
         depth=np.where(valid, depth, np.float32(0)),
         valid=valid,
-        world_from_camera=world_from_camera,
-        intrinsics=intrinsics,
-        name=f"{domain.name}-{scene.family}-{seed:06d}",
+        world_from_camera=from_first_camera(plan.scene_from_camera),
+        intrinsics=plan.intrinsics,
+        name=plan.name,
         seed=seed,
         domain=domain.name,
     )
+
+
+def from_first_camera(scene_from_camera: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """The same poses ``(t, 4, 4)`` with the first camera as the world."""
+    world_from_camera = np.linalg.inv(scene_from_camera[0]) @ scene_from_camera
+    world_from_camera[0] = np.eye(4)
+    return world_from_camera
 
 
 def _stream(seed: int, domain: Domain, what: str) -> np.random.Generator:

@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from bathyscope.errors import GeometryError
 from bathyscope_train.data.synthetic.domain import CameraRanges, choose, draw
-from bathyscope_train.data.synthetic.kernels import clearance
 from bathyscope_train.data.synthetic.scene import TUBE, Scene, Surface
+from bathyscope_train.data.synthetic.tracing import clearance
 
 Array = npt.NDArray[np.float64]
 
