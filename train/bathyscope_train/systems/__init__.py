@@ -1,0 +1,1 @@
+"""Every system of the paper's tables behind one interface."""
