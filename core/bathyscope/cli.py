@@ -24,6 +24,7 @@ _SUMMARIES = {
     "evaluate": "Measure a bundle on a data set with ground truth.",
     "export": "Turn a checkpoint into a bundle.",
     "train": "Train a network.",
+    "data": "Check data sets and prepare them.",
     "demo": "Run the shipped clip through service and client.",
 }
 _EXTRAS = {

@@ -20,11 +20,11 @@ from bathyscope.clip import Clip
 from bathyscope.engines import DepthOptions
 from bathyscope.errors import BathyscopeError
 from bathyscope.result import ClipDepth, FrameDepth, ResultMeta
-from bathyscope_serve.cuts import CutDetector
+from bathyscope.vision.cuts import CutDetector
+from bathyscope.vision.field_of_view import FieldOfView, find_field_of_view
+from bathyscope.vision.grid import Grid
 from bathyscope_serve.engine_settings import EngineSettings
-from bathyscope_serve.field_of_view import FieldOfView, find_field_of_view
 from bathyscope_serve.frames import ClipSource, FrameSource
-from bathyscope_serve.grid import Grid
 from bathyscope_serve.isolation import open_source
 from bathyscope_serve.runtime import DepthModel, OnnxModel
 from bathyscope_serve.stitch import SmallDepth, Stitcher

@@ -6,6 +6,7 @@ from typing import Self
 
 from pydantic import BaseModel, Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
+from bathyscope.vision.cuts import CutSettings
 from bathyscope_serve.decode_limits import DecodeLimits
 
 
@@ -19,14 +20,6 @@ class StitchSettings(BaseModel, frozen=True, extra="forbid"):
         default=0.5, description="Median absolute deviation of the log depth ratio that is still an alignment."
     )
     least_share: PositiveFloat = Field(default=0.05, description="Share of the pixels that the scale must rest on.")
-
-
-class CutSettings(BaseModel, frozen=True, extra="forbid"):
-    """When two neighbouring frames are taken for different scenes."""
-
-    histogram: PositiveFloat = Field(default=0.45, description="Share of pixels that change their colour cell.")
-    correlation: float = Field(default=0.35, description="Correlation of the small grey images below this.")
-    surprise: PositiveFloat = Field(default=3.0, description="Times the usual change of the last frames.")
 
 
 class EngineSettings(BaseModel, frozen=True, extra="forbid"):

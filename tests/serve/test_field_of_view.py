@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from bathyscope.bundle import InputSpec
-from bathyscope_serve.field_of_view import FieldOfView, find_field_of_view
-from bathyscope_serve.grid import Grid, choose_size
+from bathyscope.vision.field_of_view import FieldOfView, find_field_of_view
+from bathyscope.vision.grid import Grid, choose_size
 from bathyscope_serve.isolation import open_source
 
 SIZE = (240, 320)

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bathyscope_serve.cuts import CutDetector
-from bathyscope_serve.engine_settings import CutSettings
+from bathyscope.vision.cuts import CutDetector, CutSettings
 from bathyscope_serve.windows import cut_windows
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bathyscope.bundle import InputSpec
 from bathyscope.camera import F64, Size, crop_intrinsics, scale_intrinsics
-from bathyscope_serve.field_of_view import FieldOfView, Mask
+from bathyscope.vision.field_of_view import FieldOfView, Mask
 
 F32 = NDArray[np.float32]
 _LONGEST_ASPECT = 3.0

@@ -7,13 +7,21 @@ from collections import deque
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field, PositiveFloat
 
-from bathyscope_serve.engine_settings import CutSettings
-from bathyscope_serve.field_of_view import Mask
+from bathyscope.vision.field_of_view import Mask
 
 _THUMBNAIL = 32
 _CELLS = 6
 _MEMORY = 12
+
+
+class CutSettings(BaseModel, frozen=True, extra="forbid"):
+    """When two neighbouring frames are taken for different scenes."""
+
+    histogram: PositiveFloat = Field(default=0.45, description="Share of pixels that change their colour cell.")
+    correlation: float = Field(default=0.35, description="Correlation of the small grey images below this.")
+    surprise: PositiveFloat = Field(default=3.0, description="Times the usual change of the last frames.")
 
 
 class CutDetector:
