@@ -1,0 +1,52 @@
+"""The learnt position table of the DINOv2 transformer, resized by a factor.
+
+Depth Anything and its descendants resample the table bicubically by the *factor* ``(patches + 0.1) / grid``: the factor
+itself sets the sampling positions, not the ratio of the two sizes. The two passes are matrix products, so that a graph
+exports with sizes known only at run time.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+_OFFSET = 0.1
+
+
+def resized_positions(table: Float[Tensor, "1 p c"], grid: int, size: tuple[int, int]) -> Float[Tensor, "1 p2 c"]:
+    """Position embedding (class token, then patches row by row) for ``size`` (rows, columns) of patches.
+
+    Args:
+        table: Learnt table of a square grid, class token first.
+        grid: Side of that grid.
+        size: Patches needed; the table is returned as it is for its own grid.
+    """
+    rows, columns = size
+    if rows == columns == grid:
+        return table
+    square = table[:, 1:].float().unflatten(1, (grid, grid)).permute(0, 3, 1, 2)
+    down = _bicubic_by_factor(grid, rows, square)
+    across = _bicubic_by_factor(grid, columns, square)
+    resized = (down @ square @ across.transpose(0, 1)).flatten(2).transpose(1, 2)
+    return torch.cat((table[:, :1], resized.to(table.dtype)), dim=1)
+
+
+def _bicubic_by_factor(source: int, target: int, like: Tensor) -> Float[Tensor, "target source"]:
+    """Weights of the samples at ``(i + 0.5) / factor - 0.5``, borders repeated."""
+    step = source / (target + _OFFSET)
+    positions = (torch.arange(target, device=like.device, dtype=like.dtype) + 0.5) * step - 0.5
+    first = positions.floor()
+    columns = torch.arange(source, device=like.device, dtype=like.dtype)
+    weights = like.new_zeros(target, source)
+    for tap in (-1, 0, 1, 2):
+        index = (first + tap).clamp(0, source - 1)
+        value = _cubic(positions - (first + tap))
+        weights = weights + torch.where(columns == index[:, None], value[:, None], torch.zeros_like(value)[:, None])
+    return weights
+
+
+def _cubic(x: Tensor) -> Tensor:
+    """Keys' kernel with a = -3/4, as PyTorch and OpenCV use it without antialiasing."""
+    x = x.abs()
+    near = (1.25 * x - 2.25) * x * x + 1.0
+    far = ((-0.75 * x + 3.75) * x - 6.0) * x + 3.0
+    return torch.where(x <= 1, near, torch.where(x < 2, far, torch.zeros_like(x)))
