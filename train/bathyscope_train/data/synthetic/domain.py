@@ -72,6 +72,12 @@ class CameraRanges(_Ranges):
 
     fov_deg: Range = (65.0, 100.0)
     """Horizontal field of view; drawn evenly in its tangent's logarithm."""
+    distorted: Share = 0.0
+    """Share of clips whose lens bends straight lines."""
+    bend: Range = (-0.22, 0.06)
+    """Radial distortion k1 times the squared radius of the image's corner; below 0 is a barrel."""
+    bend_ratio: Range = (0.5, 1.2)
+    """k2 / k1^2; above 0.45 every ray has a pixel of its own."""
     speed: Range = (0.7, 1.3)
     """1 moves about 3 % of the mean depth a frame; narrow views move less."""
     motions: dict[Motion, float] = {"forward": 0.4, "sideways": 0.3, "turning": 0.25, "still": 0.05}
