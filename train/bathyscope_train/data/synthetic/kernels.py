@@ -11,8 +11,8 @@ from bathyscope_train.data.synthetic.tracing import free_depth, trace
 
 Array = npt.NDArray[np.float64]
 
-_NEAREST_MM = 0.3
-_ON_SURFACE_MM = 0.05  # a ray that ends further from it has left the map
+NEAREST_MM = 0.3
+ON_SURFACE_MM = 0.05  # a ray that ends further from it has left the map
 
 
 @jit
@@ -36,7 +36,7 @@ def render_frame(
     rough = np.zeros((height, width), np.bool_)
     for v in range(height):
         for u in range(width):
-            z = _ray(surface, tissue, lamp, camera, intrinsics, _NEAREST_MM, u + 0.5, v + 0.5, grain, coarse, colour)
+            z = _ray(surface, tissue, lamp, camera, intrinsics, NEAREST_MM, u + 0.5, v + 0.5, grain, coarse, colour)
             depth[v, u] = z
             for q in range(3):
                 radiance[v, u, q] = colour[q]
@@ -47,7 +47,7 @@ def render_frame(
             across = depth[v, max(u - 1, 0)] + depth[v, min(u + 1, width - 1)] - 2 * z
             along = depth[max(v - 1, 0), u] + depth[min(v + 1, height - 1), u] - 2 * z
             if rough[v, u] or abs(across) + abs(along) > 0.03 * z:
-                start = max(_NEAREST_MM, 0.85 * (z - abs(across) - abs(along)))
+                start = max(NEAREST_MM, 0.85 * (z - abs(across) - abs(along)))
                 radiance[v, u] = 0.0
                 for k in range(4):
                     du, dv = 0.25 + 0.5 * (k % 2), 0.25 + 0.5 * (k // 2)
@@ -82,7 +82,7 @@ def _ray(
     x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
     footprint = t / intrinsics[0, 0]
     shade(surface, tissue, lamp, camera, x, y, z, t, footprint, grain, coarse, colour)
-    return t / slant if abs(free_depth(surface, x, y, z)) < _ON_SURFACE_MM else 0.0
+    return t / slant if abs(free_depth(surface, x, y, z)) < ON_SURFACE_MM else 0.0
 
 
 def render(

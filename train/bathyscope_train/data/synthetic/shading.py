@@ -12,8 +12,8 @@ from bathyscope_train.data.synthetic.tracing import free_depth, normal, place
 
 Array = npt.NDArray[np.float64]
 
-_SHEEN = 0.9  # cosine below which no highlight is left: its 100th power is 3e-5
-_CREST = 0.35  # share of light that a crease keeps
+SHEEN = 0.9  # cosine below which no highlight is left: its 100th power is 3e-5
+CREST = 0.35  # share of light that a crease keeps
 
 
 class Lamp(NamedTuple):
@@ -129,7 +129,7 @@ def shade(
     vx, vy, vz = (camera[0, 3] - x) / distance, (camera[1, 3] - y) / distance, (camera[2, 3] - z) / distance
     h = surface.feature_mm
     open_space = free_depth(surface, x + h * nx, y + h * ny, z + h * nz) / h
-    open_space = _CREST + (1 - _CREST) * min(max(1.25 * open_space, 0.0), 1.0)
+    open_space = CREST + (1 - CREST) * min(max(1.25 * open_space, 0.0), 1.0)
 
     direct, highlight = 0.0, 0.0
     lights = lamp.offsets.shape[0]
@@ -146,7 +146,7 @@ def shade(
         direct += power * max((facing + 0.15) / 1.15, 0.0)
         hx, hy, hz = lx + vx, ly + vy, lz + vz
         half = (mx * hx + my * hy + mz * hz) / (np.sqrt(hx * hx + hy * hy + hz * hz) + 1e-12)
-        if half > _SHEEN:
+        if half > SHEEN:
             highlight += power * half ** (10.0 * shininess) * (shininess + 2.0) / (tissue.shininess + 2.0)
     scattered = lamp.ambient * (20.0 / (distance + 5.0))
     highlight *= 7.0 * tissue.specular

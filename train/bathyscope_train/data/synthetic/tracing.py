@@ -10,8 +10,9 @@ import numpy.typing as npt
 from bathyscope_train.data.synthetic.compiled import jit
 from bathyscope_train.data.synthetic.scene import BLOCK, TUBE, Surface
 
-_REFINEMENTS = 32
-_CLOSE_MM = 1e-4
+REFINEMENTS = 32
+CLOSE_MM = 1e-4
+FARTHEST_MM = 1000.0
 
 
 @jit
@@ -72,7 +73,7 @@ def trace(surface: Surface, start: float, ox: float, oy: float, oz: float, dx: f
     near, t, leap = 0.0, start, 0.0
     before = surface.stride_mm
     free = free_depth(surface, ox + t * dx, oy + t * dy, oz + t * dz)
-    while free > 0 and t < 1000.0:
+    while free > 0 and t < FARTHEST_MM:
         near, before = t, free
         t += max(min(0.7 * free, surface.stride_mm), 0.2 * surface.stride_mm, min(0.5 * leap, surface.leap_mm))
         row, column, reach = place(surface, ox + t * dx, oy + t * dy, oz + t * dz)
@@ -81,11 +82,11 @@ def trace(surface: Surface, start: float, ox: float, oy: float, oz: float, dx: f
         if free > surface.stride_mm:
             ring = 0 if surface.kind == TUBE else int(column) // BLOCK
             leap = surface.core[int(row) // BLOCK, ring] - reach
-    for step in range(_REFINEMENTS):  # a secant, and a bisection now and then where it crawls
+    for step in range(REFINEMENTS):  # a secant, and a bisection now and then where it crawls
         share = 0.5 if step % 4 == 3 else before / (before - free)
         middle = near + share * (t - near)
         value = free_depth(surface, ox + middle * dx, oy + middle * dy, oz + middle * dz)
-        if abs(value) < _CLOSE_MM:
+        if abs(value) < CLOSE_MM:
             return middle
         if value > 0:
             near, before = middle, value
