@@ -11,6 +11,7 @@ import typer
 
 from bathyscope.engines import DepthOptions
 from bathyscope.errors import BathyscopeError, ServiceError, SettingsError
+from bathyscope.result import DepthKind
 from bathyscope.result_files import Precision
 from bathyscope_client.batch import BatchSettings, ClipReport, run_batch
 from bathyscope_client.client import DepthClient
@@ -40,8 +41,10 @@ def depth(  # noqa: PLR0917 - typer: one parameter an option
     stride: Annotated[int, typer.Option(min=1, help="Use every n-th frame.")] = 1,
     max_frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.")] = None,
     kind: Annotated[
-        Literal["rendered", "head"],
-        typer.Option("--depth", help="Depth rendered from the scene, or the depth head's own."),
+        DepthKind,
+        typer.Option(
+            "--depth", help="Depth rendered from the scene (expected, or accumulated), or the depth head's own."
+        ),
     ] = "rendered",
     dtype: Annotated[Literal["float32", "float16"], typer.Option(help="Type of the maps in the npz.")] = "float32",
     points: Annotated[int, typer.Option(min=1, help="Most points in the cloud.")] = 500_000,

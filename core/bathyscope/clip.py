@@ -1,13 +1,43 @@
-"""A clip in memory: a few frames with their time stamps."""
+"""Frames of one clip: in memory with their time stamps, or read one by one when they are asked for."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bathyscope.errors import ClipError
+
+
+@runtime_checkable
+class FrameSequence(Protocol):
+    """RGB frames of one size in video order, each read when it is asked for; :class:`Clip` is one."""
+
+    @property
+    def name(self) -> str:
+        """What to call the clip."""
+        ...
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of every frame."""
+        ...
+
+    def __len__(self) -> int: ...
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Frame ``index`` as RGB (h, w, 3).
+
+        Raises:
+            BathyscopeError: If it cannot be read, or is not of ``size``.
+        """
+        ...
+
+    def time_s(self, index: int) -> float:
+        """Seconds from the start of the source; never decreasing."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,3 +72,11 @@ class Clip:
     def size(self) -> tuple[int, int]:
         """(height, width)."""
         return self.frames.shape[1], self.frames.shape[2]
+
+    def image(self, index: int) -> NDArray[np.uint8]:
+        """Frame ``index``, (h, w, 3), as a view."""
+        return self.frames[index]
+
+    def time_s(self, index: int) -> float:
+        """Time stamp of frame ``index`` in seconds."""
+        return float(self.timestamps_s[index])

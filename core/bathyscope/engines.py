@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Literal, Protocol, cast
+from typing import Protocol, cast
 
 from pydantic import BaseModel, PositiveInt
 
 from bathyscope.bundle import Bundle
+from bathyscope.clip import FrameSequence
 from bathyscope.errors import SettingsError
-from bathyscope.result import FrameDepth, ResultMeta
+from bathyscope.result import DepthKind, FrameDepth, ResultMeta
 
 ENGINE_GROUP = "bathyscope.engines"
 
@@ -26,8 +27,8 @@ class DepthOptions(BaseModel, frozen=True, extra="forbid"):
 
     stride: PositiveInt = 1
     """Use every n-th frame of the source."""
-    depth: Literal["rendered", "head"] = "rendered"
-    """Depth rendered from the scene of Gaussians, or the depth head's own."""
+    depth: DepthKind = "rendered"
+    """Depth rendered from the scene of Gaussians (expected, or accumulated), or the depth head's own."""
     max_frames: PositiveInt | None = None
     """Stop after this many frames of the result."""
 
@@ -70,11 +71,11 @@ class Engine(Protocol):
         """Run once on a made-up clip, so that the first real one is not slow."""
         ...
 
-    def run(self, source: Path, options: DepthOptions = ..., *, name: str | None = None) -> DepthRun:
-        """Begin with a video file, a zip of images, or a folder of images; what it is follows from its content.
+    def run(self, source: Path | FrameSequence, options: DepthOptions = ..., *, name: str | None = None) -> DepthRun:
+        """Begin with a video file, a zip or folder of images (what it is follows from its content), or with frames.
 
         Args:
-            source: File or folder.
+            source: File or folder, or frames that are read as they are needed.
             options: What is asked for.
             name: What messages and ``ResultMeta.name`` call the clip; the file's stem unless given.
         """

@@ -18,6 +18,8 @@ from bathyscope.errors import GeometryError
 
 RESULT_FORMAT = 1
 """Version of the result files; a reader refuses newer ones."""
+DepthKind = Literal["rendered", "accumulated", "head"]
+"""Where depth comes from."""
 
 
 class BundleId(BaseModel, frozen=True, extra="forbid"):
@@ -36,8 +38,10 @@ class ResultMeta(BaseModel, frozen=True, extra="forbid"):
     scale: Literal["relative", "mm"] = Field(
         default="relative", description="'relative': right up to one positive factor for each segment of the video."
     )
-    depth: Literal["rendered", "head"] = Field(
-        default="rendered", description="Depth rendered from the scene of Gaussians, or the depth head's own."
+    depth: DepthKind = Field(
+        default="rendered",
+        description="Rendered from the scene of Gaussians: 'rendered' (expected depth), 'accumulated' (not divided by "
+        "opacity: too near wherever the scene is thin); or 'head', the depth head's own.",
     )
     bundle: BundleId | None = None
     software: str = ""

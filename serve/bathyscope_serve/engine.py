@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bathyscope.bundle import Bundle, InputSpec
-from bathyscope.clip import Clip
+from bathyscope.clip import Clip, FrameSequence
 from bathyscope.engines import DepthOptions
 from bathyscope.errors import BathyscopeError
 from bathyscope.result import ClipDepth, FrameDepth, ResultMeta
@@ -24,14 +24,14 @@ from bathyscope.vision.cuts import CutDetector
 from bathyscope.vision.field_of_view import FieldOfView, find_field_of_view
 from bathyscope.vision.grid import Grid
 from bathyscope_serve.engine_settings import EngineSettings
-from bathyscope_serve.frames import ClipSource, FrameSource
+from bathyscope_serve.frames import FrameSource, SequenceSource
 from bathyscope_serve.isolation import open_source
 from bathyscope_serve.runtime import DepthModel, OnnxModel
 from bathyscope_serve.stitch import SmallDepth, Stitcher
 from bathyscope_serve.window_depth import render_window
 from bathyscope_serve.windows import Window, cut_windows
 
-Source = Path | str | BinaryIO | Clip | FrameSource
+Source = Path | str | BinaryIO | FrameSequence | FrameSource
 
 
 class StoppedError(BathyscopeError):
@@ -144,8 +144,8 @@ class DepthSession:
 
     def _open(self) -> FrameSource:
         source = self._source
-        if isinstance(source, Clip):
-            return ClipSource(source)
+        if isinstance(source, FrameSequence):
+            return SequenceSource(source)
         if hasattr(source, "survey"):
             return cast(FrameSource, source)
         with self._timed("decode"):
@@ -187,7 +187,7 @@ class DepthSession:
                 images,
                 engine.bundle.manifest.scene,
                 inside=grid.inside,
-                rendered=self._options.depth == "rendered",
+                depth=self._options.depth,
                 least_opacity=engine.settings.least_opacity,
                 run=engine.renderers.map,
             )
@@ -198,7 +198,7 @@ class DepthSession:
                 timestamp_s=frame.timestamp_s,
                 depth=view.depth,
                 confidence=view.confidence,
-                known=grid.inside,
+                known=grid.inside & (view.depth > 0),
                 world_from_camera=view.world_from_camera,
                 intrinsics=view.intrinsics,
             )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bathyscope.camera import Size
-from bathyscope.clip import Clip
+from bathyscope.clip import FrameSequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,31 +82,34 @@ class FrameSource(Protocol):
 SURVEY_FRAMES = 16
 
 
-class ClipSource:
-    """A clip in memory as a source."""
+class SequenceSource:
+    """A clip in memory, or any other sequence of frames, as a source."""
 
-    def __init__(self, clip: Clip) -> None:
-        self._clip = clip
+    def __init__(self, frames: FrameSequence) -> None:
+        self._frames = frames
 
     @property
     def name(self) -> str:
-        return self._clip.name
+        return self._frames.name
 
     @property
     def size(self) -> Size:
-        return self._clip.size
+        return self._frames.size
 
     @property
     def frame_count(self) -> int | None:
-        return len(self._clip)
+        return len(self._frames)
 
     def survey(self) -> Survey:
-        picked = np.unique(np.linspace(0, len(self._clip) - 1, SURVEY_FRAMES).astype(int))
-        return Survey(self._clip.frames[picked].max((0, 3)), len(picked))
+        picked = np.unique(np.linspace(0, len(self._frames) - 1, SURVEY_FRAMES).astype(int))
+        brightest = np.zeros(self._frames.size, np.uint8)
+        for index in picked:
+            np.maximum(brightest, self._frames.image(int(index)).max(2), out=brightest)
+        return Survey(brightest, len(picked))
 
     def __iter__(self) -> Iterator[Frame]:
-        for index, (image, time) in enumerate(zip(self._clip.frames, self._clip.timestamps_s, strict=True)):
-            yield Frame(index, float(time), image)
+        for index in range(len(self._frames)):
+            yield Frame(index, self._frames.time_s(index), self._frames.image(index))
 
     def report(self) -> SourceReport:
         return SourceReport()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bathyscope.bundle import SceneSpec
 from bathyscope.camera import F64, invert_pose, rebase
+from bathyscope.result import DepthKind
 from bathyscope.scene import WindowMaps, assemble_scene, decode_cameras
 from bathyscope.splat import prepare, render
 
@@ -45,7 +46,7 @@ def render_window(
     spec: SceneSpec,
     *,
     inside: NDArray[np.bool_],
-    rendered: bool = True,
+    depth: DepthKind = "rendered",
     least_opacity: float = 0.3,
     run: Map = map,
 ) -> list[View]:
@@ -53,20 +54,21 @@ def render_window(
 
     Rendered depth is the expected depth of the splatted scene. Where the scene is thinner than ``least_opacity`` it
     would be a guess, so the frame's own depth-head value stands there, with its confidence lowered in proportion.
+    Accumulated depth is left as it is: not divided by opacity, and 0 where there is nothing.
 
     Args:
         maps: What the network said.
         images: (t, 3, h, w) what it saw.
         spec: The bundle's reading of the raw maps.
         inside: (h, w) pixels of the field of view: nothing else becomes a Gaussian.
-        rendered: Whether to splat; if not, depth is the depth head's.
+        depth: Which depth; ``"head"`` does not splat at all.
         least_opacity: See above.
         run: Maps the frames, maybe in threads.
 
     Raises:
         GeometryError: If the network's output is no scene.
     """
-    if not rendered:
+    if depth == "head":
         cameras = decode_cameras(maps.pose_encoding, maps.size, spec.focal_epsilon)
         poses = rebase(cameras.world_from_camera)
         return [
@@ -81,8 +83,9 @@ def render_window(
         picture = render(prepared, camera_from_world[t], scene.cameras.intrinsics[t], maps.size, colour=False)
         share = np.minimum(picture.opacity / max(least_opacity, 1e-6), 1).astype(np.float32)
         solid = (picture.opacity >= least_opacity) & (picture.depth > 0)
+        expected = np.where(solid, picture.depth, maps.depth[t])
         return View(
-            depth=np.where(solid, picture.depth, maps.depth[t]).astype(np.float32),
+            depth=(picture.accumulated if depth == "accumulated" else expected).astype(np.float32),
             confidence=np.where(solid, maps.confidence[t], share * maps.confidence[t]).astype(np.float32),
             world_from_camera=scene.cameras.world_from_camera[t],
             intrinsics=scene.cameras.intrinsics[t],

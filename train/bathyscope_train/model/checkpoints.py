@@ -89,6 +89,11 @@ def load_network(path: Path | str, preset: NetworkPreset | None = None) -> tuple
     return network, _copy(network, weights)
 
 
+def names_its_network(weights: WeightFile) -> bool:
+    """Whether a file is one of ours: it carries the preset of its network."""
+    return _PRESET in weights.metadata
+
+
 def save_checkpoint(network: Network, path: Path | str, *, training: Mapping[str, Any] | None = None) -> None:
     """Write safetensors that carry the preset and, as JSON, how the weights came about.
 

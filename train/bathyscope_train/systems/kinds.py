@@ -1,0 +1,101 @@
+"""The kinds of system that are opened from published weights, and how each is told by the names of its tensors.
+
+Recognising needs neither torch nor network: a few keys and shapes that no other kind has. Loading then compares
+every key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from bathyscope_train.systems.system import System, SystemOptions
+
+Shapes = Mapping[str, tuple[int, ...]]
+"""Shape of every tensor of a file, by its name without the wrappers ``module.`` and ``model.``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One published network."""
+
+    name: str
+    """What the user calls it: ``vda-s``."""
+    weights: str
+    """What is to be had where, and under which licence; said when the weights are not at hand."""
+    recognises: Callable[[Shapes], bool]
+    """Whether a file with these tensors is of this kind."""
+    open: Callable[[Path, Kind, SystemOptions], System]
+    """Load it. Raises CheckpointError if the file does not hold exactly the network."""
+    member: str | None = None
+    """The file by which a folder of weights is recognised, for networks that are published as several files."""
+
+
+def has(shapes: Shapes, key: str, *sides: int | None) -> bool:
+    """Whether there is a tensor of this name and shape; ``None`` stands for any side."""
+    found = shapes.get(key)
+    return (
+        found is not None
+        and len(found) == len(sides)
+        and all(b in (None, a) for a, b in zip(found, sides, strict=True))
+    )
+
+
+def _is_anysplat(shapes: Shapes) -> bool:
+    return has(shapes, "encoder.aggregator.camera_token", 1, 2, 1, 1024) and any(
+        key.startswith("encoder.gaussian_param_head.") for key in shapes
+    )
+
+
+def _is_vggt(shapes: Shapes) -> bool:
+    return has(shapes, "aggregator.camera_token", 1, 2, 1, 1024)
+
+
+def _is_vda(width: int) -> Callable[[Shapes], bool]:
+    def recognises(shapes: Shapes) -> bool:
+        return (
+            has(shapes, "pretrained.pos_embed", 1, None, width)
+            and any(key.startswith("head.motion_modules.") for key in shapes)
+            and any(key.startswith("head.scratch.output_conv2.") for key in shapes)
+            and not any("lora_" in key for key in shapes)
+        )
+
+    return recognises
+
+
+def _open_anysplat(path: Path, kind: Kind, options: SystemOptions) -> System:
+    from bathyscope_train.systems.networks import open_published
+
+    return open_published(path, kind.name, "anysplat", options)
+
+
+def _open_vggt(path: Path, kind: Kind, options: SystemOptions) -> System:
+    from bathyscope_train.systems.networks import open_published
+
+    return open_published(path, kind.name, "vggt", options)
+
+
+def _open_vda(path: Path, kind: Kind, options: SystemOptions) -> System:
+    from bathyscope_train.systems.vda.system import open_vda
+
+    return open_vda(path, kind.name, options)
+
+
+def _vda(letter: str, width: int, licence: str) -> tuple[Kind, Kind]:
+    file = f"video_depth_anything_vit{letter}.pth"
+    recognises = _is_vda(width)
+    return (
+        Kind(f"vda-{letter}", f"{file} of Video Depth Anything, {licence}", recognises, _open_vda),
+        Kind(f"vda-{letter}-metric", f"metric_{file} of Video Depth Anything, {licence}", recognises, _open_vda),
+    )
+
+
+KINDS: tuple[Kind, ...] = (
+    Kind("anysplat", "model.safetensors of lhjiang/anysplat", _is_anysplat, _open_anysplat),
+    Kind("vggt", "model.safetensors of facebook/VGGT-1B", _is_vggt, _open_vggt),
+    *_vda("s", 384, "Apache-2.0"),
+    *_vda("b", 768, "CC-BY-NC-4.0"),
+    *_vda("l", 1024, "CC-BY-NC-4.0"),
+)
+"""Every kind. Of two that read the same tensors the first is meant, unless the user or the file's name says more."""
