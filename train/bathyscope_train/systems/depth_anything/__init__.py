@@ -2,7 +2,8 @@
 
 ::
 
-    encoder.py     the DINOv2 transformer without registers; its position table is resized by factor, not by size
+    encoder.py     the DINOv2 transformer without registers, tapped at four blocks
+    positions.py   the learnt position table, resized by a factor as published
     pyramid.py     the DPT trunk: four tapped layers to four fused paths, with a place for something between them
     adapters.py    linear layers with low-rank or scaling adapters, and how to merge them away
     neck.py        the convolutional neck after chosen blocks
