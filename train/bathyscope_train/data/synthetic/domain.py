@@ -12,6 +12,7 @@ from bathyscope.errors import SettingsError
 
 Family = Literal["lumen", "cavity", "sinus"]
 Name = TypeVar("Name", bound=str)
+View = Literal["round", "corners", "rectangle"]
 Motion = Literal["forward", "sideways", "turning", "still"]
 
 
@@ -106,10 +107,61 @@ class SensorRanges(_Ranges):
     """Standard deviation of the blur, for an image 140 pixels wide."""
     blurred: Share = 0.3
     round_view: Share = 0.0
-    """Share of clips that show a round (or corner-cut) field of view; outside is black and not valid."""
+    """Share of clips that show a part of the image only; outside is black and not valid."""
+    views: dict[View, float] = {"round": 0.7, "corners": 0.3}
+    """Weights of the shapes of such a part."""
+    view_offset: Range = (-0.03, 0.03)
+    """Distance of its middle from the image's along each axis, in image widths."""
     compressed: Share = 0.0
     """Share of clips that went through JPEG."""
     quality: Range = (60.0, 95.0)
+    hold: Range = (0.0, 0.0)
+    """Mean change in levels below which a block of a compressed video is not sent again."""
+    aperture_mm: Range = (0.0, 0.0)
+    """Opening of the lens, which blurs what is out of focus; 0 is a pinhole."""
+    focus: Range = (0.7, 2.5)
+    """Distance in focus, in median depths of the first frame."""
+    shutter: Range = (0.0, 0.0)
+    """Share of the time between two frames that the shutter is open: motion blur."""
+    interlaced: Share = 0.0
+    """Share of clips whose odd rows show the instant half a frame later."""
+    glare: Range = (0.0, 0.0)
+    """Share of the light that the lens scatters widely over the image."""
+    fringe_px: Range = (0.0, 0.0)
+    """How far red and blue part at the sides of an image 140 pixels wide."""
+    warmth: Range = (0.0, 0.0)
+    """Wrong white balance: logarithm of red over blue."""
+    tint: Range = (0.0, 0.0)
+    """Wrong white balance: logarithm of green over the mean of red and blue."""
+    drift: Range = (0.0, 0.0)
+    """Amplitude with which both wander during a clip."""
+    shot: Range = (0.0, 0.0)
+    """Standard deviation of the photon noise at full light, before the gamma curve; it goes with the root of light."""
+    read: Range = (0.0, 0.0)
+    """Standard deviation of the read-out noise, before the gamma curve."""
+    grain_px: Range = (0.0, 0.0)
+    """Standard deviation of the blur that demosaicing gives the noise; its colour gets twice that."""
+    chroma: Range = (1.0, 1.0)
+    """Strength of the noise's colour against its brightness; 1 is independent noise in red, green and blue."""
+    sharpen: Range = (0.0, 0.0)
+    """Strength of the processor's sharpening, which leaves halos."""
+    sharpen_px: Range = (0.6, 1.6)
+    """Standard deviation of the blur that the sharpening subtracts."""
+    overlay: Share = 0.0
+    """Share of clips with writing in the black around a round view."""
+
+
+class AirRanges(_Ranges):
+    """What floats between lens and tissue."""
+
+    smoky: Share = 0.0
+    """Share of clips with smoke or haze."""
+    opacity: Range = (0.1, 0.6)
+    """Share of light that it takes on the way from the median depth."""
+    veil: Range = (0.3, 1.2)
+    """Brightness of the smoke against the metered radiance of the first frame."""
+    wisps: Range = (0.0, 0.6)
+    """How uneven it is."""
 
 
 class Domain(_Ranges):
@@ -120,12 +172,17 @@ class Domain(_Ranges):
     """Weights of the kinds of scene."""
     light: LightRanges = LightRanges()
     material: MaterialRanges = MaterialRanges()
+    air: AirRanges = AirRanges()
     camera: CameraRanges = CameraRanges()
     sensor: SensorRanges = SensorRanges()
 
     @model_validator(mode="after")
     def _something_to_draw(self) -> Self:
-        for what, weights in (("families", self.families), ("camera.motions", self.camera.motions)):
+        for what, weights in (
+            ("families", self.families),
+            ("camera.motions", self.camera.motions),
+            ("sensor.views", self.sensor.views),
+        ):
             if min(weights.values(), default=0.0) < 0 or sum(weights.values()) <= 0:
                 raise ValueError(f"{what} needs weights of at least 0 with a positive sum, got {weights}")
         return self
