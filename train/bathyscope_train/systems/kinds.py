@@ -15,6 +15,8 @@ from bathyscope_train.systems.system import System, SystemOptions
 Shapes = Mapping[str, tuple[int, ...]]
 """Shape of every tensor of a file, by its name without the wrappers ``module.`` and ``model.``."""
 
+_WRAPPERS = ("module.", "model.")
+
 
 @dataclass(frozen=True, slots=True)
 class Kind:
@@ -30,6 +32,13 @@ class Kind:
     """Load it. Raises CheckpointError if the file does not hold exactly the network."""
     member: str | None = None
     """The file by which a folder of weights is recognised, for networks that are published as several files."""
+
+
+def bare(key: str) -> str:
+    """A key without the wrappers that training programs put before it."""
+    while (wrapper := next((each for each in _WRAPPERS if key.startswith(each)), None)) is not None:
+        key = key.removeprefix(wrapper)
+    return key
 
 
 def has(shapes: Shapes, key: str, *sides: int | None) -> bool:

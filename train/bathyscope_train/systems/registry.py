@@ -26,12 +26,11 @@ from bathyscope.errors import CheckpointError, SettingsError
 from bathyscope.result import DepthKind
 from bathyscope_train.systems.baselines import BASELINES
 from bathyscope_train.systems.engine_system import EngineSystem
-from bathyscope_train.systems.kinds import KINDS, Kind, Shapes
+from bathyscope_train.systems.kinds import KINDS, Kind, bare
 from bathyscope_train.systems.options import refuse_options
 from bathyscope_train.systems.system import System, SystemOptions
 
 _LABEL = re.compile(r"([A-Za-z0-9][A-Za-z0-9_.+-]*)=(.+)", re.DOTALL)
-_WRAPPERS = ("module.", "model.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +145,7 @@ def _recognise(path: Path, name: SystemName) -> Kind | None:
         if wanted is not None:
             raise CheckpointError(f"{path}: says itself which network it holds; it is no {wanted.name}")
         return None
-    shapes = _bare(weights.shapes)
+    shapes = {bare(key): shape for key, shape in weights.shapes.items()}
     fitting = [kind for kind in found if kind.recognises(shapes)]
     if wanted is not None and wanted not in fitting:
         what = f"those of {fitting[0].name}" if fitting else f"{len(shapes)} unknown ones, like {next(iter(shapes))}"
@@ -167,12 +166,3 @@ def _by_file_name(path: Path, kinds: list[Kind]) -> Kind:
 
 def _kind(name: str) -> Kind | None:
     return next((kind for kind in KINDS if kind.name == name), None)
-
-
-def _bare(shapes: Shapes) -> Shapes:
-    def bare(key: str) -> str:
-        while (wrapper := next((w for w in _WRAPPERS if key.startswith(w)), None)) is not None:
-            key = key.removeprefix(wrapper)
-        return key
-
-    return {bare(key): shape for key, shape in shapes.items()}
