@@ -6,7 +6,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bathyscope_train.model.dense_head import resize_bilinear
-from bathyscope_train.systems.depth_anything.adapters import ENCODER_MLPS, AdaptedLinear, adapt, merge_adapters
+from bathyscope_train.systems.depth_anything.adapters import ENCODER_MLPS, adapt, merge_adapters
 from bathyscope_train.systems.depth_anything.disparity import SigmoidPyramid
 from bathyscope_train.systems.depth_anything.encoder import Encoder
 from bathyscope_train.systems.depth_anything.neck import add_necks
@@ -54,8 +54,3 @@ class DepthNetwork(nn.Module):
         plain = merge_adapters(self)
         plain.settings = self.settings.model_copy(update={"adapter": None})
         return plain
-
-    @property
-    def merged(self) -> bool:
-        """Whether there are no adapters in it."""
-        return not any(isinstance(layer, AdaptedLinear) for layer in self.modules())

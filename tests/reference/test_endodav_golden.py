@@ -1,0 +1,127 @@
+"""EndoDAV against runs of the published implementation (every folder of ``endodav/`` with a config)."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from bathyscope_train.systems.depth_anything.disparity import DepthRange
+from bathyscope_train.systems.endodav import EndoDav, EndoDavSettings
+from bathyscope_train.systems.vda.settings import VdaSettings
+
+REFERENCE = Path(os.environ.get("BATHYSCOPE_REFERENCE", Path(__file__).parents[2] / "../shared/reference"))
+CASES = sorted(path.parent for path in (REFERENCE / "endodav").glob("*/config.json"))
+TOLERANCE = 1e-4
+
+pytestmark = pytest.mark.skipif(not CASES, reason=f"no endodav/*/config.json under {REFERENCE}")
+every_case = pytest.mark.parametrize("folder", CASES, ids=lambda path: path.name)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One case: what was asked, what the published network computed on the way and said."""
+
+    network: EndoDav
+    arrays: dict[str, np.ndarray]
+    observed: dict[str, Tensor]
+    """What our modules gave, by their names in the checkpoint."""
+    disparities: tuple[Tensor, ...]
+
+
+def settings_of(folder: Path) -> EndoDavSettings:
+    config = json.loads((folder / "config.json").read_text())
+    lora = config.get("lora_type")
+    return EndoDavSettings(
+        network=VdaSettings(
+            width=config["embed_dim"],
+            depth=config["depth"],
+            heads=config["num_heads"],
+            taps=tuple(config["layers"]),
+            grid=config["pos_grid"],
+            features=config["features"],
+            channels=tuple(config["out_channels"]),
+            frames=config["num_frames"],
+        ),
+        image_size=tuple(config["image_shape"]),
+        adapter=None if lora in (None, "none") else lora,
+        temporal_adapter=config["temporal_lora"],
+        rank=config["r"],
+        neck=tuple(config["residual_block_indexes"]),
+        head="video" if config["disable_conv_head"] else "sigmoid",
+        output="sigmoid" if config.get("out_sigmoid") else "relu",
+        depth_range=DepthRange(nearest=config["min_depth"], farthest=config["max_depth"]),
+    )
+
+
+@cache
+def load(folder: Path) -> EndoDav:
+    network = EndoDav(settings_of(folder)).eval()
+    network.load_state_dict(load_file(folder / "weights.safetensors"))
+    return network
+
+
+@cache
+def run(folder: Path) -> Run:
+    network = load(folder)
+    with np.load(folder / "forward.npz") as file:
+        arrays = dict(file)
+    observed: dict[str, Tensor] = {}
+
+    def keep(name: str) -> object:
+        def hook(_: nn.Module, __: object, output: Tensor) -> None:
+            observed.setdefault(name, output)
+
+        return hook
+
+    names = [key.removeprefix("inter_") for key in arrays if key.startswith("inter_")]
+    hooks = [network.get_submodule(name).register_forward_hook(keep(name)) for name in names]
+    with torch.no_grad():
+        disparities = network(torch.from_numpy(arrays["input"]))
+    for hook in hooks:
+        hook.remove()
+    return Run(network, arrays, observed, disparities)
+
+
+def assert_close(observed: Tensor | np.ndarray, expected: np.ndarray) -> None:
+    assert observed.shape == expected.shape
+    assert np.abs(np.asarray(observed) - expected).max() <= TOLERANCE * np.abs(expected).max()
+
+
+@every_case
+def test_intermediate_maps_match(folder: Path) -> None:
+    case = run(folder)
+    names = [key for key in case.arrays if key.startswith("inter_")]
+    assert names
+    for name in names:
+        observed, expected = case.observed[name.removeprefix("inter_")], case.arrays[name]
+        if "motion_modules" in name:
+            observed = observed.transpose(1, 2)
+        frames = min(len(observed), len(expected))  # the fine half runs on chunks of frames; hooks keep the first chunk
+        assert frames > 0
+        assert_close(observed[:frames], expected[:frames])
+
+
+@every_case
+def test_disparities_of_all_scales_match(folder: Path) -> None:
+    case = run(folder)
+    for scale in range(4):
+        assert_close(case.disparities[scale], case.arrays[f"disp_{scale}"])
+
+
+@every_case
+def test_merging_leaves_no_adapter_and_the_same_disparities(folder: Path) -> None:
+    case = run(folder)
+    merged = case.network.merge()
+    assert not any("lora" in name for name in merged.state_dict())
+    with torch.no_grad():
+        for observed, expected in zip(merged(torch.from_numpy(case.arrays["input"])), case.disparities, strict=True):
+            torch.testing.assert_close(observed, expected, atol=1e-5 * float(expected.abs().max()), rtol=0)
