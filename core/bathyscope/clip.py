@@ -75,7 +75,8 @@ class Clip:
 
     def image(self, index: int) -> NDArray[np.uint8]:
         """Frame ``index``, (h, w, 3), as a view."""
-        return self.frames[index]
+        image: NDArray[np.uint8] = self.frames[index]
+        return image
 
     def time_s(self, index: int) -> float:
         """Time stamp of frame ``index`` in seconds."""

@@ -44,7 +44,7 @@ class VideoDepthAnything(nn.Module):
         """The same for images that are normalised already."""
         b, t, _, height, width = images.shape
         taps = self.pretrained(images.flatten(0, 1))
-        values = self.head(taps, self.pretrained.token_grid((height, width)), t, (height, width))
+        values: Tensor = self.head(taps, self.pretrained.token_grid((height, width)), t, (height, width))
         return values.unflatten(0, (b, t))
 
 

@@ -110,7 +110,7 @@ class TemporalTransformer(nn.Module):
         tokens = self.proj_in(tokens)
         for block in self.transformer_blocks:
             tokens = block(tokens)
-        seen = self.proj_out(tokens).reshape(b, h, w, t, c).permute(0, 3, 4, 1, 2)
+        seen: Tensor = self.proj_out(tokens).reshape(b, h, w, t, c).permute(0, 3, 4, 1, 2)
         return maps + seen
 
 
