@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 from pydantic import BaseModel, PositiveFloat, PositiveInt, ValidationError
 
-from bathyscope.camera import Size
+from bathyscope.camera import F64, Size
 from bathyscope.errors import DatasetError
 
 
@@ -28,6 +29,11 @@ class Calibration(BaseModel, frozen=True):
     def size(self) -> Size:
         """(height, width)."""
         return self.height, self.width
+
+    @property
+    def matrix(self) -> F64:
+        """(3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
 
 def check_size(path: Path, shape: tuple[int, ...], size: Size) -> None:

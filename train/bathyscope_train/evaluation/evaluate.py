@@ -19,7 +19,7 @@ from bathyscope_train.evaluation.alignment import median_scale
 from bathyscope_train.evaluation.baselines import brightness_depth, constant_depth
 from bathyscope_train.evaluation.folders import DatasetFolder
 from bathyscope_train.evaluation.metrics import NAMES, UNITS_OF_DEPTH, depth_errors, mean_errors
-from bathyscope_train.evaluation.poses import pose_scores
+from bathyscope_train.evaluation.poses import TruePoses, pose_scores
 from bathyscope_train.evaluation.reports import (
     Counts,
     DepthScores,
@@ -190,9 +190,10 @@ def _network_report(
 ) -> NetworkReport:
     depth = depth_scores(truth, prediction.depth, keep)
     true = folder.calibration
+    true_poses = TruePoses(folder.world_from_camera, true.pose_unit, true.depth_unit)
     return NetworkReport(
         depth=depth,
-        poses=pose_scores(folder, prediction.world_from_camera, prediction.segment, gap, depth.scale),
+        poses=pose_scores(true_poses, prediction.world_from_camera, prediction.segment, gap, depth.scale),
         focal=FocalScores(
             fx_ratio=float(np.median(prediction.intrinsics[:, 0, 0])) / true.fx,
             fy_ratio=float(np.median(prediction.intrinsics[:, 1, 1])) / true.fy,

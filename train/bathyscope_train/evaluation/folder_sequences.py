@@ -47,8 +47,11 @@ class FolderSequence:
 
     @property
     def depth_range(self) -> tuple[float, float] | None:
-        """``depth_valid`` of ``intrinsics.json``."""
-        return self.folder.calibration.depth_valid
+        """``depth_valid`` of ``intrinsics.json``, or else whatever its 16-bit depth maps can hold."""
+        calibration = self.folder.calibration
+        if calibration.depth_valid is not None or calibration.depth_scale is None:
+            return calibration.depth_valid
+        return 0.0, 65536 * calibration.depth_scale
 
     @property
     def intrinsics(self) -> F64 | None:

@@ -71,12 +71,15 @@ def depth_errors(truth: NDArray[np.floating], predicted: NDArray[np.floating]) -
     if g.size == 0:
         return DepthErrors(*(float("nan"),) * len(NAMES))
     difference = g - p
-    ratio = np.maximum(g / p, p / g)
+    squared = difference * difference
+    quotient = g / p
+    ratio = np.maximum(quotient, 1.0 / quotient)
+    log_ratio = np.log(quotient)
     return DepthErrors(
         abs_rel=float(np.mean(np.abs(difference) / g)),
-        sq_rel=float(np.mean(difference**2 / g)),
-        rmse=float(np.sqrt(np.mean(difference**2))),
-        rmse_log=float(np.sqrt(np.mean((np.log(g) - np.log(p)) ** 2))),
+        sq_rel=float(np.mean(squared / g)),
+        rmse=float(np.sqrt(np.mean(squared))),
+        rmse_log=float(np.sqrt(np.mean(log_ratio * log_ratio))),
         delta1=float(np.mean(ratio < _DELTA)),
         delta2=float(np.mean(ratio < _DELTA**2)),
         delta3=float(np.mean(ratio < _DELTA**3)),

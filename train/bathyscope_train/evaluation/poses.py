@@ -1,13 +1,15 @@
-"""Pose scores of a predicted trajectory on a data set folder."""
+"""Pose scores of a predicted trajectory against true poses."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.camera import F64
-from bathyscope_train.evaluation.folders import DatasetFolder
+from bathyscope.camera import F64, invert_pose
 from bathyscope_train.evaluation.reports import PoseScores
+from bathyscope_train.evaluation.snippets import SNIPPET_FRAMES, SnippetErrors, relative_poses, snippet_errors
 from bathyscope_train.evaluation.trajectory import (
     TrajectoryErrors,
     frame_pairs,
@@ -19,20 +21,33 @@ from bathyscope_train.evaluation.trajectory import (
 _MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
 
 
+@dataclass(frozen=True)
+class TruePoses:
+    """What is known of the camera of a sequence."""
+
+    world_from_camera: F64
+    """(t, 4, 4), NaN for frames without a pose."""
+    unit: str | None
+    """Of their positions."""
+    depth_unit: str | None
+    """Of the true depth of the same frames."""
+
+
 def pose_scores(
-    folder: DatasetFolder, predicted: F64, segment: NDArray[np.integer], gap: int, depth_scale: float | None
+    true_poses: TruePoses, predicted: F64, segment: NDArray[np.integer], gap: int, depth_scale: float | None
 ) -> PoseScores | None:
-    """Scores of predicted poses (t, 4, 4), t at most the folder's frames; None where the folder has no poses.
+    """Scores of predicted poses (t, 4, 4), t at most the frames of the truth; None where no frame has a true pose.
 
     Args:
-        folder: The truth.
+        true_poses: The truth.
         predicted: ``world_from_camera`` of the first t frames.
         segment: (t,) frames of one segment share one predicted world.
         gap: Frames between the cameras of a pair.
         depth_scale: True length of one unit of predicted depth.
     """
     frames = len(predicted)
-    true, usable = folder.world_from_camera[:frames], folder.has_pose[:frames]
+    true = true_poses.world_from_camera[:frames]
+    usable = np.asarray(np.isfinite(true).all(axis=(1, 2)))
     if not usable.any():
         return None
     pairs = frame_pairs(usable, segment, gap)
@@ -41,8 +56,9 @@ def pose_scores(
     largest = max(aligned, key=lambda part: part[0], default=None)
     scale = float("nan") if largest is None else largest[1].scale
     rpe_translation, rpe_rotation = relative_pose_errors(true, predicted, pairs, scale)
+    snippets = _snippets(true, predicted, usable, segment)
     return PoseScores(
-        unit=folder.calibration.pose_unit or "unknown",
+        unit=true_poses.unit or "unknown",
         gap=gap,
         pairs=len(pairs),
         rotation_error_deg_mean=_mean(relative.rotation_error_deg),
@@ -56,7 +72,9 @@ def pose_scores(
         ate_rmse=_pooled([(n, part.ate_rmse) for n, part in aligned]),
         ate_standing_still=_pooled([(n, part.standing_still) for n, part in aligned]),
         aligned_frames=sum(n for n, _ in aligned),
-        pose_scale_over_depth_scale=_scale_agreement(folder, scale, depth_scale),
+        pose_scale_over_depth_scale=_scale_agreement(true_poses, scale, depth_scale),
+        snippet_ate_mean=None if snippets is None else float(snippets.ate.mean()),
+        snippet_rotation_deg_mean=None if snippets is None else float(np.degrees(snippets.rotation_rad.mean())),
     )
 
 
@@ -77,9 +95,18 @@ def _pooled(parts: list[tuple[int, float]]) -> float:
     return float(np.sqrt(sum(n * value**2 for n, value in parts) / total)) if total else float("nan")
 
 
-def _scale_agreement(folder: DatasetFolder, pose_scale: float, depth_scale: float | None) -> float | None:
+def _snippets(
+    true: F64, predicted: F64, usable: NDArray[np.bool_], segment: NDArray[np.integer]
+) -> SnippetErrors | None:
+    """Snippet errors where every frame has a pose and the prediction is one world; otherwise None."""
+    if len(true) < SNIPPET_FRAMES or not usable.all() or len(np.unique(segment)) > 1:
+        return None
+    return snippet_errors(relative_poses(invert_pose(true)), relative_poses(invert_pose(predicted)))
+
+
+def _scale_agreement(true_poses: TruePoses, pose_scale: float, depth_scale: float | None) -> float | None:
     """How many times longer a predicted unit is by the poses than by the depth."""
-    depth_unit, pose_unit = folder.calibration.depth_unit, folder.calibration.pose_unit
+    depth_unit, pose_unit = true_poses.depth_unit, true_poses.unit
     if depth_scale is None or not np.isfinite(pose_scale) or depth_unit is None or pose_unit is None:
         return None
     if depth_unit == pose_unit:

@@ -62,6 +62,9 @@ class PoseScores(_Strict):
     aligned_frames: int
     pose_scale_over_depth_scale: Number
     """1 where depth and camera motion of the prediction share one scale; null if their units cannot be compared."""
+    snippet_ate_mean: Number = None
+    """The field's ATE over snippets of 5 frames; null where a frame has no pose or the prediction has a cut."""
+    snippet_rotation_deg_mean: Number = None
 
 
 class FocalScores(_Strict):
