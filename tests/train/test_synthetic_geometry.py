@@ -13,7 +13,7 @@ from bathyscope_train.data.synthetic.shading import Lamp
 from bathyscope_train.data.synthetic.tissue import make_tissue
 
 SIZE = (56, 70)
-FAMILIES = ("lumen", "cavity", "sinus")
+FAMILIES = ("lumen", "cavity", "sinus", "larynx", "closeup", "indoor")
 
 
 def clip_of(family: str, seed: int) -> SyntheticClip:
@@ -84,7 +84,7 @@ def plane(distance: float) -> Surface:
 
 def test_a_plane_has_its_distance_as_depth_everywhere() -> None:
     surface = plane(37.0)
-    _, depth = render(surface, tissue_of((200, 200), wrap=False), LAMP, np.eye(4), K, SIZE)
+    depth = render(surface, tissue_of((200, 200), wrap=False), LAMP, np.eye(4), K, SIZE).depth
     np.testing.assert_allclose(depth, 37.0, atol=2e-3)
 
 
@@ -103,7 +103,7 @@ def test_a_cylinder_has_the_depth_of_its_closed_form() -> None:
     )
     camera = np.eye(4)
     camera[:2, 3] = shift
-    _, depth = render(surface, tissue_of((800, 512), wrap=True), LAMP, camera, K, SIZE)
+    depth = render(surface, tissue_of((800, 512), wrap=True), LAMP, camera, K, SIZE).depth
     # |shift + z (a, b)| = radius along the ray (a, b, 1)
     slope = (pixel_centres(SIZE) - K[:2, 2]) / 40.0
     a, b, c = (slope**2).sum(-1), slope @ shift, shift @ shift - radius**2
@@ -116,7 +116,9 @@ def test_a_cylinder_has_the_depth_of_its_closed_form() -> None:
 def test_light_falls_off_with_the_stated_power_of_the_distance() -> None:
     lamp = LAMP._replace(offsets=np.array([[4.0, 0.0, 0.0]]), soft_mm=2.0)
     surface, tissue = plane(30.0), tissue_of((200, 200), wrap=False)
-    images = {p: render(surface, tissue, lamp._replace(falloff=p), np.eye(4), K, SIZE)[0] for p in (0.0, 1.3, 2.0)}
+    images = {
+        p: render(surface, tissue, lamp._replace(falloff=p), np.eye(4), K, SIZE).radiance for p in (0.0, 1.3, 2.0)
+    }
     points = np.concatenate([(pixel_centres(SIZE) - K[:2, 2]) / 40.0 * 30.0, np.full((*SIZE, 1), 30.0)], axis=-1)
     reach = np.linalg.norm(points - lamp.offsets[0], axis=-1)
     for power in (1.3, 2.0):
@@ -126,7 +128,7 @@ def test_light_falls_off_with_the_stated_power_of_the_distance() -> None:
 
 def test_a_spot_dims_with_the_power_of_the_cosine_to_the_view() -> None:
     surface, tissue = plane(30.0), tissue_of((200, 200), wrap=False)
-    even, spot = (render(surface, tissue, LAMP._replace(spot=s), np.eye(4), K, SIZE)[0] for s in (0.0, 2.5))
+    even, spot = (render(surface, tissue, LAMP._replace(spot=s), np.eye(4), K, SIZE).radiance for s in (0.0, 2.5))
     slope = (pixel_centres(SIZE) - K[:2, 2]) / 40.0
     cosine = 1 / np.sqrt((slope**2).sum(-1) + 1)
     np.testing.assert_allclose(spot[..., 1] / even[..., 1], cosine**2.5, rtol=1e-3)
@@ -143,12 +145,12 @@ def test_hue_of_a_surface_point_does_not_depend_on_the_view() -> None:
     moved = base.copy()
     moved[:3, 3] += (5.0, -3.0, 4.0)
     images = [render(scene.surface, tissue, LAMP, pose, K, SIZE) for pose in (base, moved)]
-    depth = images[0][1].astype(float)[..., None]
+    depth = images[0].depth.astype(float)[..., None]
     points = np.concatenate([(pixel_centres(SIZE) - K[:2, 2]) / 40.0 * depth, depth], axis=-1) - (5.0, -3.0, 4.0)
     u, v = (np.float32(40.0 * points[..., i] / points[..., 2] + K[i, 2] - 0.5) for i in range(2))
     visible = (u > 0) & (v > 0) & (u < SIZE[1] - 1) & (v < SIZE[0] - 1)
-    visible &= np.abs(cv2.remap(images[1][1], u, v, cv2.INTER_LINEAR) - points[..., 2]) < 0.5
-    hues = [np.log(image[..., 1] / image[..., 0]) for image, _ in images]
+    visible &= np.abs(cv2.remap(images[1].depth, u, v, cv2.INTER_LINEAR) - points[..., 2]) < 0.5
+    hues = [np.log(image[..., 1] / image[..., 0]) for image, *_ in images]
     difference = np.abs(hues[0] - cv2.remap(np.float32(hues[1]), u, v, cv2.INTER_LINEAR))[visible]
     assert visible.mean() > 0.4
     assert np.median(difference) < 0.1 * hues[0][visible].std()

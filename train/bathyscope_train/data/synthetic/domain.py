@@ -10,10 +10,10 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_va
 
 from bathyscope.errors import SettingsError
 
-Family = Literal["lumen", "cavity", "sinus"]
+Family = Literal["lumen", "cavity", "sinus", "larynx", "closeup", "indoor"]
 Name = TypeVar("Name", bound=str)
 View = Literal["round", "corners", "rectangle"]
-Motion = Literal["forward", "sideways", "turning", "still"]
+Motion = Literal["forward", "sideways", "turning", "still", "orbit", "parallel"]
 
 
 def _ordered(bounds: tuple[float, float]) -> tuple[float, float]:
@@ -45,6 +45,22 @@ class LightRanges(_Ranges):
     """Share of clips with a second light guide opposite to the first."""
     ambient: Range = (0.0, 0.012)
     """Light that bounced before it reached the surface, against the direct light at 20 mm."""
+    tilt_deg: Range = (0.0, 0.0)
+    """Angle between the beam's axis and the lens's."""
+    coned: Share = 0.0
+    """Share of clips whose beam has an edge."""
+    cone_deg: Range = (28.0, 55.0)
+    """Angle of that edge from the beam's axis."""
+    edge_deg: Range = (4.0, 18.0)
+    """Half width of the edge."""
+
+
+class Palette(_Ranges):
+    """Another family of tissue colours; see ``MaterialRanges``."""
+
+    red: Range
+    green_over_red: Range
+    blue_over_green: Range
 
 
 class MaterialRanges(_Ranges):
@@ -66,6 +82,33 @@ class MaterialRanges(_Ranges):
     vessels: Range = (25.0, 60.0)
     """Vessel trees a scene."""
     vessel_contrast: Range = (0.25, 0.6)
+    palettes: tuple[Palette, ...] = ()
+    """Other palettes, each as likely for a scene as the one above."""
+    regions: Range = (0.0, 0.0)
+    """Logarithm of the contrast of large light and dark regions, which have nothing to do with the shape."""
+    region_share: Range = (0.08, 0.5)
+    """Size of such regions against the shorter side of the surface."""
+    banded: Share = 0.0
+    """Share of scenes with painted bands, light or dark."""
+    bloody: Share = 0.0
+    """Share of scenes with blood on the surface."""
+    slimy: Share = 0.0
+    """Share of scenes with mucus."""
+    foamy: Share = 0.0
+    """Share of scenes with bubbles."""
+    coated: Share = 0.0
+    """Share of scenes under a wet film with sharp highlights of its own."""
+    coat: Range = (0.5, 4.0)
+    """Strength of the film's highlights; more than that of the tissue, as they are smaller."""
+    coat_shininess: Range = (60.0, 260.0)
+    coat_bump: Range = (0.01, 0.09)
+    """Root mean square slope of the film, which bends and breaks its highlights."""
+    dry: Range = (-2.0, 0.8)
+    """Where the film is broken, in standard deviations of the blotches; -2 is wet everywhere."""
+    fine: Range = (0.0, 0.0)
+    """Strength of the third octave of blotches and relief, finer than a millimetre."""
+    capillaries: Range = (0.0, 0.0)
+    """Density of the finest vessels, seen from near."""
 
 
 class CameraRanges(_Ranges):
@@ -83,6 +126,30 @@ class CameraRanges(_Ranges):
     """1 moves about 3 % of the mean depth a frame; narrow views move less."""
     motions: dict[Motion, float] = {"forward": 0.4, "sideways": 0.3, "turning": 0.25, "still": 0.05}
     """Weights of the kinds of path."""
+    slow: Share = 0.0
+    """Share of clips that move at ``slow_speed``, drawn evenly in its logarithm, in place of ``speed``."""
+    slow_speed: Range = (0.04, 0.4)
+    trembling: Share = 0.0
+    """Share of clips whose camera is held by a hand that trembles."""
+    tremor_deg: Range = (0.02, 0.35)
+    """Amplitude of the tremor's turns; its shifts match them at the distance looked at."""
+    pausing: Share = 0.0
+    """Share of clips in which the camera stops for a while."""
+
+
+class LifeRanges(_Ranges):
+    """What moves beside the camera."""
+
+    instruments: Share = 0.0
+    """Share of clips in which one or two instruments pass through the view; none in rooms."""
+    breathing: Share = 0.0
+    """Share of clips whose tissue heaves in place."""
+    peristalsis: Share = 0.0
+    """Share of clips along whose tissue a wave travels."""
+    amplitude: Range = (0.01, 0.06)
+    """Height of either, against the radius of a tube or a third of a field's width."""
+    period: Range = (14.0, 60.0)
+    """Frames a breath or a wave takes."""
 
 
 class SensorRanges(_Ranges):
@@ -174,6 +241,7 @@ class Domain(_Ranges):
     material: MaterialRanges = MaterialRanges()
     air: AirRanges = AirRanges()
     camera: CameraRanges = CameraRanges()
+    life: LifeRanges = LifeRanges()
     sensor: SensorRanges = SensorRanges()
 
     @model_validator(mode="after")

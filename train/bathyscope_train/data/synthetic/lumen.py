@@ -6,6 +6,7 @@ import numpy.typing as npt
 
 from bathyscope_train.data.synthetic.domain import MaterialRanges
 from bathyscope_train.data.synthetic.noise import periodic_noise
+from bathyscope_train.data.synthetic.passage import passage
 from bathyscope_train.data.synthetic.scene import TUBE, Scene, make_surface
 from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette
 
@@ -125,7 +126,9 @@ def _polyp(random: np.random.Generator, z: Array, theta: Array, radius: float) -
 
 
 def sinus(random: np.random.Generator, material: MaterialRanges) -> Scene:
-    """A narrow passage, higher than wide, with long rounded ridges like the turbinates of a nose."""
+    """A nose: a narrow tube, higher than wide, with long rounded ridges, or, twice as often, an open passage."""
+    if random.uniform() < 0.67:
+        return passage(random, material)
     radius = random.uniform(6.0, 11.0)
     z = np.arange(-15.0, random.uniform(45.0, 80.0), 0.2, dtype=np.float32)
     theta = diamond_angles(_COLUMNS)

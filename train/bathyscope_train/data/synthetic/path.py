@@ -1,14 +1,17 @@
-"""Smooth camera paths through a scene: forwards, sideways, turning, nearly still."""
+"""Camera paths through a scene: forwards, sideways, turning, round a point, nearly still; with pauses and tremor."""
 
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial.transform import Rotation, Slerp
 
 from bathyscope.errors import GeometryError
 from bathyscope_train.data.synthetic.domain import CameraRanges, choose, draw
-from bathyscope_train.data.synthetic.scene import TUBE, Scene, Surface
-from bathyscope_train.data.synthetic.tracing import clearance
+from bathyscope_train.data.synthetic.scene import NOTHING, TUBE, Scene, Stage, Surface
+from bathyscope_train.data.synthetic.solid_tracing import solid_clearance
+from bathyscope_train.data.synthetic.solids import frame_towards
+from bathyscope_train.data.synthetic.tracing import clearance, free_depth
 
 Array = npt.NDArray[np.float64]
 
@@ -26,7 +29,10 @@ _MANNERS = {
     "sideways": _Manner(0.35, 1.6, 0.7),
     "turning": _Manner(0.5, 0.5, 1.6),
     "still": _Manner(0.05, 0.08, 0.15),
+    "orbit": _Manner(0.3, 2.0, 0.1),
+    "parallel": _Manner(0.3, 1.5, 0.1),
 }
+_TRIES = 60
 _SHARE_PER_FRAME = 0.03  # of the mean depth, moved in one frame at speed 1
 _TURN_DEG = 11.0  # amplitude of the slow swing at speed 1 and a view of 80 degrees
 
@@ -59,30 +65,113 @@ def _look(forward: Array, yaw: Array, pitch: Array, roll: Array) -> Array:
     return frame @ yawed @ pitched @ rolled
 
 
-def camera_path(random: np.random.Generator, scene: Scene, ranges: CameraRanges, fov_deg: float, frames: int) -> Array:
+def camera_path(  # noqa: PLR0917 - what decides the path, in the order of its making
+    random: np.random.Generator,
+    hand: np.random.Generator,
+    scene: Scene,
+    ranges: CameraRanges,
+    fov_deg: float,
+    frames: int,
+) -> Array:
     """Draw a path of poses, ``scene_from_camera`` ``(t, 4, 4)``.
 
     Args:
-        random: Source of every choice.
+        random: Source of the path.
+        hand: Source of slowness, pauses and tremor, so that a path is the same with and without them.
         scene: Where the camera moves.
         ranges: Speeds and kinds of path.
         fov_deg: Horizontal field of view; narrow views move and turn less.
         frames: Length of the path.
     """
-    manner = _MANNERS[choose(random, ranges.motions)]
-    pace = draw(random, ranges.speed) * min(1.0, fov_deg / 80.0)
-    place = _through_tube if scene.surface.kind == TUBE else _over_field
-    positions, forward = place(random, scene.surface, manner, pace, frames)
+    kind = choose(random, ranges.motions)
+    manner = _MANNERS[kind]
+    speed = draw(random, ranges.speed)
+    if hand.uniform() < ranges.slow:
+        speed = float(np.exp(hand.uniform(*np.log(ranges.slow_speed))))
+    pace = speed * min(1.0, fov_deg / 80.0)
+    if scene.stage is not None:
+        positions, forward = _on_stage(random, scene, scene.stage, manner, pace, frames)
+    else:
+        place = _through_tube if scene.surface.kind == TUBE else _over_field
+        positions, forward = place(random, scene.surface, manner, pace, frames)
+    if kind == "orbit":
+        forward = _round(positions, forward)
+    elif kind == "parallel":
+        forward = np.broadcast_to(forward[:1], forward.shape)
 
     swing = np.radians(_TURN_DEG) * manner.turn * pace
     gaze = np.radians(fov_deg) * 0.22
+    level = scene.stage is not None and scene.stage.upright
+    if level:
+        gaze *= 0.5
     yaw = swing * _swing(random, frames) + random.uniform(-gaze, gaze)
     pitch = swing * _swing(random, frames) + random.uniform(-gaze, gaze)
-    roll = 1.2 * swing * _swing(random, frames) + random.uniform(-np.pi, np.pi)
+    roll = 1.2 * swing * _swing(random, frames) + random.uniform(-np.pi, np.pi) * (0.05 if level else 1.0)
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, :3] = _look(forward, yaw, pitch, roll)
     poses[:, :3, 3] = positions
+    if hand.uniform() < ranges.pausing:
+        poses = _paused(hand, poses)
+    if hand.uniform() < ranges.trembling:
+        poses = _shaken(hand, poses, scene, draw(hand, ranges.tremor_deg), float(np.linalg.norm(forward[0])))
     return poses
+
+
+def _round(positions: Array, forward: Array) -> Array:
+    """Towards one point all the time."""
+    return np.asarray(positions[0] + forward[0] - positions)
+
+
+def _paused(hand: np.random.Generator, poses: Array) -> Array:
+    """The same path, with one or two stops on the way and so not quite to its end."""
+    frames = len(poses)
+    speed = np.ones(frames)
+    for _ in range(int(hand.integers(1, 3))):
+        start, length = hand.uniform(0, frames), hand.uniform(2, max(3.0, 0.6 * frames))
+        edge = np.abs(np.arange(frames) - start - length / 2) - length / 2
+        speed *= np.clip(0.5 + edge / 2.0, 0.0, 1.0)
+    time = np.concatenate([[0.0], np.cumsum(speed)[:-1]])
+    return _at(poses, np.clip(time, 0, frames - 1))
+
+
+def _at(poses: Array, time: Array) -> Array:
+    """Poses between the frames of a path: positions on the chord, rotations on the arc."""
+    if len(poses) == 1:
+        return poses[np.zeros(len(time), int)]
+    rotations = Slerp(np.arange(len(poses)), Rotation.from_matrix(poses[:, :3, :3]))(time)
+    between = np.tile(np.eye(4), (len(time), 1, 1))
+    between[:, :3, :3] = rotations.as_matrix()
+    for axis in range(3):
+        between[:, axis, 3] = np.interp(time, np.arange(len(poses)), poses[:, axis, 3])
+    return between
+
+
+def _shaken(hand: np.random.Generator, poses: Array, scene: Scene, tremor_deg: float, distance: float) -> Array:
+    """The same path in a hand that trembles; the shifts are left out where they would touch something."""
+    time = np.arange(len(poses))[:, None]
+    signal = np.zeros((len(poses), 6))
+    for _ in range(3):
+        period, phase = hand.uniform(2.2, 9.0, 6), hand.uniform(0, 2 * np.pi, 6)
+        signal += hand.uniform(0.2, 1.0, 6) * np.sin(2 * np.pi * time / period + phase) / 1.5
+    amplitude = np.radians(tremor_deg)
+    shaken = poses.copy()
+    shaken[:, :3, :3] = poses[:, :3, :3] @ Rotation.from_rotvec(amplitude * signal[:, :3]).as_matrix()
+    moved = poses[:, :3, 3] + hand.uniform(0.0, 1.0) * amplitude * distance * signal[:, 3:]
+    before = min(_room(scene, point, 0.0) for point in poses[:, :3, 3])
+    if min(_room(scene, point, 0.0) for point in moved) > 0.7 * before:
+        shaken[:, :3, 3] = moved
+    return shaken
+
+
+def _room(scene: Scene, point: Array, aside_mm: float) -> float:
+    """How far a point is from everything, roughly: of a surface the least within ``aside_mm`` to the sides."""
+    x, y, z = (float(value) for value in point)
+    free = solid_clearance(scene.solids, x, y, z)
+    if scene.surface.kind == NOTHING:
+        return free
+    for dx, dy in ((0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)):
+        free = min(free, free_depth(scene.surface, x + dx * aside_mm, y + dy * aside_mm, z))
+    return free
 
 
 def _keep_clear(surface: Surface, base: Array, offset: Array, margin_mm: float) -> Array:
@@ -140,3 +229,35 @@ def _over_field(
     base[2] -= max(0.0, 0.08 * extent - floor)
     positions = _keep_clear(surface, np.tile(base, (frames, 1)), offset, 0.05 * extent)
     return positions, target - positions
+
+
+def _on_stage(  # noqa: PLR0917 - as above
+    random: np.random.Generator, scene: Scene, stage: Stage, manner: _Manner, pace: float, frames: int
+) -> tuple[Array, Array]:
+    """Round the stage's target, at its distance; the offset shrinks, or another place is tried, until it is clear."""
+    for _ in range(_TRIES):
+        target = np.array(stage.target) + random.uniform(-1, 1, 3) * stage.spread_mm
+        slant, azimuth = np.radians(random.uniform(*stage.slant_deg)), random.uniform(0, 2 * np.pi)
+        frame = frame_towards(np.array(stage.back), np.zeros(3))[:3, :3]
+        away = frame @ (np.sin(slant) * np.cos(azimuth), np.sin(slant) * np.sin(azimuth), np.cos(slant))
+        distance = random.uniform(*stage.distance_mm)
+        base = target + distance * away
+        if _room(scene, base, stage.margin_mm) < stage.margin_mm:
+            continue
+        axes = frame_towards(away, np.zeros(3))[:3, :3]
+        step = 1.9 * _SHARE_PER_FRAME * distance * pace
+        local = np.zeros((frames, 3))
+        for axis, share in enumerate((manner.across, manner.across, manner.along)):
+            drift = random.choice([-1.0, 1.0]) * random.uniform(0.3, 1.0) * np.arange(frames)
+            local[:, axis] = step * share * (0.6 * drift + 4.0 * _swing(random, frames))
+        local *= min(1.0, 0.7 * distance / max(1e-6, float(np.abs(local).max())))
+        offset = local @ axes.T
+        follow = random.uniform(0.0, 1.0)
+        for share in (1.0, 0.75, 0.5, 0.3, 0.15):
+            positions = base + share * offset
+            if min(_room(scene, point, stage.margin_mm) for point in positions) >= stage.margin_mm:
+                return positions, target + follow * share * offset - positions
+    raise GeometryError(
+        f"no camera path of {frames} frames in a scene of the family {scene.family} keeps {stage.margin_mm:.1f} mm "
+        "from everything; lower the speed of the domain's camera"
+    )

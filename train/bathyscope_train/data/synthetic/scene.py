@@ -1,8 +1,8 @@
-"""A rendered scene: one displaced surface as a map, its colours, and the solid grain of its tissue.
+"""A rendered scene: one displaced surface as a map, its colours, the solid grain of its tissue, and hard bodies.
 
-All scenes are one of two surfaces. A *tube* has a radius map over (z, angle) around a centreline that is a
+Tissue is one of two surfaces. A *tube* has a radius map over (z, angle) around a centreline that is a
 function of z; a *field* has a depth map over (y, x). Both are the zero of a function that is positive in
-the free space where the camera moves, so that one kernel traces both.
+the free space where the camera moves, so that one kernel traces both. A room has no tissue, only solids.
 """
 
 from typing import NamedTuple
@@ -11,11 +11,15 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from bathyscope_train.data.synthetic.solids import NO_SOLIDS, Solids
+
 Array = npt.NDArray[np.float32]
 
 TUBE = 0
 FIELD = 1
+NOTHING = 2
 BLOCK = 8
+EVEN = np.ones((1, 1), np.float32)
 
 
 class Surface(NamedTuple):
@@ -23,7 +27,7 @@ class Surface(NamedTuple):
 
     kind: int
     heights: Array
-    """``(rows, columns)``: radius over (z, diamond angle) of a tube, depth z over (y, x) of a field."""
+    """``(rows, columns)``: radius over (z, diamond angle) of a tube, depth z over (y, x) of a field, else unused."""
     centre: Array
     """``(rows, 2)``: x and y of a tube's centreline at each row; zeros for a field."""
     first: tuple[float, float]
@@ -61,6 +65,37 @@ class Tissue(NamedTuple):
     bump: float
     specular: float
     shininess: float
+    gloss: Array = EVEN
+    """``(rows, columns)`` on the surface's own grid: highlights against those of the rest; one number is 1."""
+    coat: float = 0.0
+    """Strength of the highlights of a wet film."""
+    coat_shininess: float = 150.0
+    coat_bump: float = 0.0
+    """Slope of the film's relief, which bends and breaks its highlights."""
+    dry: float = -3.0
+    """Level of the blotches below which the film is gone."""
+    fine: float = 0.0
+    """Strength of a third, finer octave of blotches and relief."""
+    capillaries: float = 0.0
+
+
+class Stage(NamedTuple):
+    """Where a camera may stand; scenes without one are entered as their kind of surface suggests."""
+
+    target: tuple[float, float, float]
+    """What the camera looks at, more or less."""
+    spread_mm: tuple[float, float, float]
+    """How far the look may stray from it along each axis."""
+    distance_mm: tuple[float, float]
+    """From the target to the camera."""
+    slant_deg: tuple[float, float]
+    """Angle between ``back`` and the way to the camera."""
+    margin_mm: float
+    """How far the camera stays from everything."""
+    back: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    """From the target towards the usual place of the camera."""
+    upright: bool = False
+    """Whether the camera is held level, as in a room."""
 
 
 class Scene(NamedTuple):
@@ -69,6 +104,14 @@ class Scene(NamedTuple):
     family: str
     surface: Surface
     tissue: Tissue
+    solids: Solids = NO_SOLIDS
+    stage: Stage | None = None
+
+
+def smooth_field(heights: npt.NDArray[np.floating], samples: float) -> Array:
+    """Blur the depth map of a field, so that no step is steeper than the map resolves."""
+    blurred = cv2.GaussianBlur(np.asarray(heights, np.float32), (0, 0), samples, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred, np.float32)
 
 
 def make_surface(

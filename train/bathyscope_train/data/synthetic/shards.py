@@ -2,23 +2,29 @@
 
 import os
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from bathyscope.errors import DatasetError, SettingsError
 from bathyscope_train.data.synthetic.clip import SyntheticClip, render_clip
 from bathyscope_train.data.synthetic.domain import Domain
+from bathyscope_train.data.synthetic.lens import PINHOLE, Distortion
+from bathyscope_train.data.synthetic.swell import Swell
 
 _FORMAT = 1
 
 
 def write_clip(path: Path, clip: SyntheticClip) -> None:
-    """Write a clip beside ``path`` and rename it into place. Depth is kept as float16 millimetres (0.05 %)."""
+    """Write a clip beside ``path`` and rename it into place. Depth is kept as float16 millimetres (0.05 %).
+
+    The arrays are named as the clip's fields; the swell's begin with ``swell_`` and are there only where it is.
+    """
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     with beside.open("wb") as file:
         np.savez(
@@ -28,6 +34,10 @@ def write_clip(path: Path, clip: SyntheticClip) -> None:
             depth=clip.depth.astype(np.float16),
             world_from_camera=clip.world_from_camera,
             intrinsics=clip.intrinsics,
+            distortion=np.array(clip.distortion, np.float64),
+            mover=clip.mover,
+            world_from_mover=clip.world_from_mover,
+            **_swell_arrays(clip.swell),
             name=np.array(clip.name),
             seed=np.int64(clip.seed),
             domain=np.array(clip.domain),
@@ -47,18 +57,45 @@ def read_clip(path: Path) -> SyntheticClip:
             if found != _FORMAT:
                 raise DatasetError(f"{path}: clip format {found}, this build reads {_FORMAT}; render the clips again")
             depth = file["depth"].astype(np.float32)
+            count = len(depth)
+            moves = "mover" in file
             return SyntheticClip(
                 frames=file["frames"],
                 depth=depth,
                 valid=depth > 0,
                 world_from_camera=file["world_from_camera"],
                 intrinsics=file["intrinsics"],
+                distortion=Distortion(*map(float, file["distortion"])) if "distortion" in file else PINHOLE,
+                mover=file["mover"] if moves else np.zeros(depth.shape, np.uint8),
+                world_from_mover=file["world_from_mover"] if moves else np.zeros((count, 0, 4, 4)),
+                swell=_read_swell(file),
                 name=str(file["name"]),
                 seed=int(file["seed"]),
                 domain=str(file["domain"]),
             )
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise DatasetError(f"{path}: not a rendered clip: {error}") from error
+
+
+def _swell_arrays(swell: Swell | None) -> dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
+    """The swell's numbers under names of their own; nothing where the tissue stands still."""
+    if swell is None:
+        return {}
+    return {f"swell_{name}": np.asarray(value, np.float64) for name, value in swell._asdict().items()}
+
+
+def _read_swell(file: Mapping[str, Any]) -> Swell | None:
+    if "swell_kind" not in file:
+        return None
+    numbers = {name: file[f"swell_{name}"] for name in Swell._fields}
+    return Swell(
+        kind=int(numbers["kind"]),
+        waves=numbers["waves"],
+        centre=numbers["centre"],
+        first=float(numbers["first"]),
+        step=float(numbers["step"]),
+        scene_from_world=numbers["scene_from_world"],
+    )
 
 
 def clip_paths(root: Path) -> list[Path]:
