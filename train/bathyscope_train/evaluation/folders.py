@@ -98,11 +98,16 @@ def _read_poses(path: Path, frames: tuple[Path, ...]) -> F64:
             continue
         if words[0] not in index:
             raise DatasetError(f"{path}, line {line}: pose of {words[0]}, but there is no such file in frames/")
-        poses[index[words[0]]] = _parse_pose(words[1:], f"{path}, line {line}")
+        poses[index[words[0]]] = parse_pose(words[1:], f"{path}, line {line}")
     return poses
 
 
-def _parse_pose(words: list[str], where: str) -> F64:
+def parse_pose(words: list[str], where: str) -> F64:
+    """A rigid ``world_from_camera`` from 16 numbers, row by row.
+
+    Raises:
+        DatasetError: If they are none; names ``where`` they come from.
+    """
     try:
         values = [float(word) for word in words]
     except ValueError as error:

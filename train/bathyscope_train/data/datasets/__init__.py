@@ -1,0 +1,1 @@
+"""Data sets as they lie on disk: readers, split lists, checks. Nothing here imports torch."""

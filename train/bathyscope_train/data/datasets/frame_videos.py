@@ -1,0 +1,150 @@
+"""Frames of a video file, in any order, decoded with PyAV in this process: for videos of one's own.
+
+FFmpeg gets an open file, no path and no protocol, so a playlist that calls itself a video leads nowhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from bathyscope.camera import Size
+from bathyscope.errors import DatasetError
+from bathyscope_train.data.datasets.sequence import Image
+
+VIDEO_ENDINGS = frozenset((".mp4", ".mov", ".mkv", ".webm", ".avi", ".m4v", ".mpg", ".mpeg"))
+_CONTAINERS = "mov,mp4,m4a,3gp,3g2,mj2,matroska,webm,avi,mpeg,mpegvideo"
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """What demuxing alone tells of a video."""
+
+    times: tuple[int, ...]
+    """Presentation time of each frame, in units of the stream."""
+    size: Size
+
+
+@dataclass(eq=False)
+class VideoFrames:
+    """The frames of a video. Reading in order decodes each once; a jump begins at the key frame before it.
+
+    Args:
+        path: The file.
+        upper_half: Take the upper half of each picture: the left eye of a video that stacks both.
+    """
+
+    path: Path
+    upper_half: bool = False
+    _decoder: Iterator[tuple[int, Image]] | None = field(default=None, init=False, repr=False)
+    _next: int = field(default=0, init=False, repr=False)
+
+    def __len__(self) -> int:
+        return len(self._table.times)
+
+    @property
+    def size(self) -> Size:
+        """(height, width) of a frame."""
+        height, width = self._table.size
+        return (height // 2 if self.upper_half else height), width
+
+    def where(self, index: int) -> str:
+        """The file and the number of the frame."""
+        return f"{self.path}, frame {index}"
+
+    def read(self, index: int) -> Image:
+        """A frame.
+
+        Raises:
+            DatasetError: If it cannot be decoded.
+        """
+        if not 0 <= index < len(self):
+            raise DatasetError(f"{self.path}: frame {index} of {len(self)}")
+        wanted = self._table.times[index]
+        if self._decoder is None or not 0 <= index - self._next <= _LONGEST_WALK:
+            self._decoder = self._decode_from(wanted)
+        for time, image in self._decoder:
+            if time >= wanted:
+                self._next = index + 1
+                if time == wanted:
+                    return image[: image.shape[0] // 2] if self.upper_half else image
+                self._decoder = None
+                break
+        else:
+            self._decoder = None
+        raise DatasetError(f"{self.where(index)}: it cannot be decoded; the file is damaged there")
+
+    @cached_property
+    def _table(self) -> _Table:
+        import av
+
+        with self.path.open("rb") as file, _opened(self.path, file) as container:
+            stream = _pictures(self.path, container)
+            try:
+                times = [packet.pts for packet in container.demux(stream) if packet.size and not packet.is_discard]
+            except av.FFmpegError as error:
+                raise DatasetError(f"{self.path}: the video is damaged ({_reason(error)})") from error
+            size = stream.height, stream.width
+        if not times or 0 in size:
+            raise DatasetError(f"{self.path}: the video holds no frames")
+        if None in times or len(set(times)) < len(times):
+            raise DatasetError(
+                f"{self.path}: frames without time stamps of their own; convert the video to mp4 (ffmpeg -i IN OUT.mp4)"
+            )
+        return _Table(tuple(sorted(times)), size)
+
+    def _decode_from(self, time: int) -> Iterator[tuple[int, Image]]:
+        """Time and picture of frames from the key frame before ``time`` on; damaged ones are passed over."""
+        import av
+
+        with self.path.open("rb") as file, _opened(self.path, file) as container:
+            stream = _pictures(self.path, container)
+            stream.codec_context.thread_count = 1
+            if time > self._table.times[0]:
+                container.seek(time, stream=stream, backward=True)
+            for packet in container.demux(stream):
+                try:
+                    decoded = packet.decode()
+                except av.FFmpegError:
+                    continue
+                for frame in decoded:
+                    if frame.pts is not None and (frame.pts >= time):
+                        yield frame.pts, frame.to_ndarray(format="rgb24")
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"path": self.path, "upper_half": self.upper_half}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _decoder=None, _next=0)
+
+
+_LONGEST_WALK = 64
+"""Frames that are decoded and thrown away rather than looking for a key frame."""
+
+
+def is_video(path: Path) -> bool:
+    """Whether a file calls itself a video."""
+    return path.suffix.lower() in VIDEO_ENDINGS and path.is_file() and not path.name.startswith(".")
+
+
+def _opened(path: Path, file: Any) -> Any:
+    import av
+
+    try:
+        return av.open(file, mode="r", options={"protocol_whitelist": "", "format_whitelist": _CONTAINERS})
+    except (av.FFmpegError, ValueError) as error:
+        raise DatasetError(f"{path}: not a video that can be read ({_reason(error)})") from error
+
+
+def _pictures(path: Path, container: Any) -> Any:
+    if not container.streams.video:
+        kinds = " and ".join(sorted({str(stream.type) for stream in container.streams})) or "nothing"
+        raise DatasetError(f"{path}: no video stream ({kinds} only)")
+    return container.streams.video[0]
+
+
+def _reason(error: Exception) -> str:
+    return str(getattr(error, "strerror", None) or error)
