@@ -38,7 +38,12 @@ class Grid:
     def fit(cls, field_of_view: FieldOfView, wanted: InputSpec) -> Grid:
         """The grid for a field of view: its shape, the network's area, whole patches."""
         top, left, bottom, right = field_of_view.box
-        size = choose_size((bottom - top, right - left), wanted.patch, wanted.pixels)
+        return cls.of(field_of_view, choose_size((bottom - top, right - left), wanted.patch, wanted.pixels))
+
+    @classmethod
+    def of(cls, field_of_view: FieldOfView, size: Size) -> Grid:
+        """The grid of a given size, whatever the proportions of the field of view."""
+        top, left, bottom, right = field_of_view.box
         share = _shrink(field_of_view.mask[top:bottom, left:right].astype(np.float32), size)
         inside = share > 0.999
         return cls(field_of_view, size, inside if inside.any() else share > 0)
