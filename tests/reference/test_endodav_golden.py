@@ -14,8 +14,13 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
+from bathyscope.affine_stitch import AffineStitcher
+from bathyscope.clip import Clip
+from bathyscope.keyed_windows import keyed_windows
+from bathyscope.resizing import resize_corners
 from bathyscope_train.systems.depth_anything.disparity import DepthRange
 from bathyscope_train.systems.endodav import EndoDav, EndoDavSettings
+from bathyscope_train.systems.endodav.system import endodav_system
 from bathyscope_train.systems.vda.settings import VdaSettings
 
 REFERENCE = Path(os.environ.get("BATHYSCOPE_REFERENCE", Path(__file__).parents[2] / "../shared/reference"))
@@ -125,3 +130,36 @@ def test_merging_leaves_no_adapter_and_the_same_disparities(folder: Path) -> Non
     with torch.no_grad():
         for observed, expected in zip(merged(torch.from_numpy(case.arrays["input"])), case.disparities, strict=True):
             torch.testing.assert_close(observed, expected, atol=1e-5 * float(expected.abs().max()), rtol=0)
+
+
+@cache
+def video(folder: Path) -> dict[str, np.ndarray]:
+    with np.load(folder / "video.npz") as file:
+        return dict(file)
+
+
+@cache
+def estimated(folder: Path) -> np.ndarray:
+    frames = video(folder)["frames"]
+    system = endodav_system(load(folder), name="golden")
+    return np.stack([frame.values for frame in system.estimate(Clip(frames, np.arange(len(frames)) / 25.0))])
+
+
+@every_case
+def test_depth_of_a_long_video_is_the_published_one(folder: Path) -> None:
+    """Compared as inverse depth: next to the farthest depth, rounding of the disparity is magnified 200,000 times."""
+    assert_close(1 / estimated(folder), 1 / video(folder)["depth"])
+
+
+@every_case
+def test_stitched_disparity_and_its_scales_are_the_published_ones(folder: Path) -> None:
+    golden = video(folder)
+    system = endodav_system(load(folder), name="golden").disparities
+    frames, stitcher = golden["frames"], AffineStitcher(system.rule)
+    observed: list[np.ndarray] = []
+    for window in keyed_windows(map(system.prepare, frames), system.rule):
+        values = resize_corners(system.predict(np.stack(window.items)), frames.shape[1:3])
+        observed.extend(stitcher.add(values, window.fresh))
+    observed.extend(stitcher.finish())
+    assert_close(np.stack(observed), golden["disp"])
+    np.testing.assert_allclose(np.reshape(stitcher.affine, (-1, 2)), golden["scale_shift"], rtol=1e-4, atol=1e-4)

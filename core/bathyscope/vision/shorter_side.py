@@ -1,6 +1,7 @@
-"""The resizing rule of Depth Anything: the shorter side becomes what was asked for, both multiples of the patch.
+"""The resizing rules of Depth Anything and its descendants: aspect kept, both sides multiples of the patch.
 
-Long pictures are made smaller on the way, so that they cost no more than a 16:9 one.
+Depth Anything makes the shorter side what was asked for, and long pictures smaller on the way, so that they cost no
+more than a 16:9 one. EndoDAV covers a rectangle.
 """
 
 from __future__ import annotations
@@ -37,6 +38,20 @@ def network_size(frame: Size, side: int, patch: int = 14) -> Size:
         raise ClipError(f"frames of {frame[0]}x{frame[1]} at side {side} leave less than one patch of {patch} pixels")
     scale = max(least / frame[0], least / frame[1])
     return _to_multiple(scale * frame[0], least, patch), _to_multiple(scale * frame[1], least, patch)
+
+
+def covering_size(frame: Size, least: Size, patch: int = 14) -> Size:
+    """Smallest (height, width) of the frame's aspect, in multiples of the patch, that covers ``least``: EndoDAV's rule.
+
+    Each side is rounded to the nearest multiple, and up where that would be less than ``least`` asks for.
+
+    Args:
+        frame: (height, width) of the frames.
+        least: (height, width) that neither side may fall below.
+        patch: What height and width must be multiples of.
+    """
+    scale = max(least[0] / frame[0], least[1] / frame[1])
+    return _to_multiple(scale * frame[0], least[0], patch), _to_multiple(scale * frame[1], least[1], patch)
 
 
 def to_network(image: NDArray[np.uint8], size: Size) -> F32:

@@ -16,6 +16,10 @@ Shapes = Mapping[str, tuple[int, ...]]
 """Shape of every tensor of a file, by its name without the wrappers ``module.`` and ``model.``."""
 
 _WRAPPERS = ("module.", "model.")
+_DEPTH_FILE = "depth_model.pth"
+_ENDODAC_WEIGHTS = (
+    f"{_DEPTH_FILE} of BeileiCui/EndoDAC, or its folder with pose_encoder.pth, pose.pth, intrinsics_head.pth"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,10 +71,28 @@ def _is_vda(width: int) -> Callable[[Shapes], bool]:
             has(shapes, "pretrained.pos_embed", 1, None, width)
             and any(key.startswith("head.motion_modules.") for key in shapes)
             and any(key.startswith("head.scratch.output_conv2.") for key in shapes)
-            and not any("lora_" in key for key in shapes)
+            and not any("lora_" in key or ".residual_." in key for key in shapes)
         )
 
     return recognises
+
+
+def _is_endodac(width: int) -> Callable[[Shapes], bool]:
+    def recognises(shapes: Shapes) -> bool:
+        return has(shapes, "encoder.pos_embed", 1, None, width) and any(
+            key.startswith("depth_head.conv_depth_") for key in shapes
+        )
+
+    return recognises
+
+
+def _is_endodav(shapes: Shapes) -> bool:
+    """Video Depth Anything with anything that it has not: adapters, a neck, sigmoid heads."""
+    return (
+        has(shapes, "pretrained.pos_embed", 1, None, None)
+        and any(key.startswith("head.motion_modules.") for key in shapes)
+        and any("lora_" in key or ".residual_." in key or "head.conv_depth_" in key for key in shapes)
+    )
 
 
 def _open_anysplat(path: Path, kind: Kind, options: SystemOptions) -> System:
@@ -91,6 +113,18 @@ def _open_vda(path: Path, kind: Kind, options: SystemOptions) -> System:
     return open_vda(path, kind.name, options)
 
 
+def _open_endodac(path: Path, kind: Kind, options: SystemOptions) -> System:
+    from bathyscope_train.systems.endodac.system import open_endodac
+
+    return open_endodac(path, kind.name, options)
+
+
+def _open_endodav(path: Path, kind: Kind, options: SystemOptions) -> System:
+    from bathyscope_train.systems.endodav.system import open_endodav
+
+    return open_endodav(path, kind.name, options)
+
+
 def _vda(letter: str, width: int, licence: str) -> tuple[Kind, Kind]:
     file = f"video_depth_anything_vit{letter}.pth"
     recognises = _is_vda(width)
@@ -106,5 +140,8 @@ KINDS: tuple[Kind, ...] = (
     *_vda("s", 384, "Apache-2.0"),
     *_vda("b", 768, "CC-BY-NC-4.0"),
     *_vda("l", 1024, "CC-BY-NC-4.0"),
+    Kind("endodac", _ENDODAC_WEIGHTS, _is_endodac(768), _open_endodac, member=_DEPTH_FILE),
+    Kind("endodac-s", f"{_ENDODAC_WEIGHTS}, trained on ViT-S", _is_endodac(384), _open_endodac, member=_DEPTH_FILE),
+    Kind("endodav", f"{_DEPTH_FILE} of Zanue/EndoDAV", _is_endodav, _open_endodav, member=_DEPTH_FILE),
 )
 """Every kind. Of two that read the same tensors the first is meant, unless the user or the file's name says more."""

@@ -1,8 +1,11 @@
 """Sigmoid disparities at four scales, and what a disparity of these networks means."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
+import numpy as np
 from jaxtyping import Float
+from numpy.typing import NDArray
 from pydantic import BaseModel, PositiveFloat
 from torch import Tensor, nn
 
@@ -11,6 +14,8 @@ from bathyscope_train.systems.depth_anything.pyramid import Pyramid
 
 _HIDDEN = 32
 
+Values = TypeVar("Values", Tensor, NDArray[np.float32])
+
 
 class DepthRange(BaseModel, frozen=True, extra="forbid"):
     """The depths, in the network's own unit, that a disparity of 1 and of 0 stand for."""
@@ -18,7 +23,7 @@ class DepthRange(BaseModel, frozen=True, extra="forbid"):
     nearest: PositiveFloat = 0.1
     farthest: PositiveFloat = 150.0
 
-    def scaled(self, disparity: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    def scaled(self, disparity: Values) -> Values:
         """Inverse depth: ``1 / farthest + (1 / nearest - 1 / farthest) * disparity``.
 
         A disparity above 1, which networks without a sigmoid give, lies nearer than ``nearest``.
@@ -26,7 +31,7 @@ class DepthRange(BaseModel, frozen=True, extra="forbid"):
         low, high = 1 / self.farthest, 1 / self.nearest
         return low + (high - low) * disparity
 
-    def depth(self, disparity: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    def depth(self, disparity: Values) -> Values:
         """Depth of a network disparity: one over :meth:`scaled`."""
         return 1 / self.scaled(disparity)
 

@@ -31,17 +31,23 @@ def resized_positions(table: Float[Tensor, "1 p c"], grid: int, size: tuple[int,
 
 
 def _bicubic_by_factor(source: int, target: int, like: Tensor) -> Float[Tensor, "target source"]:
-    """Weights of the samples at ``(i + 0.5) / factor - 0.5``, borders repeated."""
-    step = source / (target + _OFFSET)
-    positions = (torch.arange(target, device=like.device, dtype=like.dtype) + 0.5) * step - 0.5
+    """Weights of the samples at ``(i + 0.5) / factor - 0.5``, borders repeated.
+
+    PyTorch's kernel holds the step and the position in float32 and multiplies without rounding in between; the table's
+    values change by 1e-5 where this does not.
+    """
+    wanted = torch.full((), target, device=like.device, dtype=torch.float64)
+    step = (source / (wanted + _OFFSET)).float().double()
+    places = torch.arange(target, device=like.device, dtype=torch.float64) + 0.5
+    positions = (places * step - 0.5).float().double()
     first = positions.floor()
-    columns = torch.arange(source, device=like.device, dtype=like.dtype)
-    weights = like.new_zeros(target, source)
+    columns = torch.arange(source, device=like.device, dtype=torch.float64)
+    weights = torch.zeros(target, source, device=like.device, dtype=torch.float64)
     for tap in (-1, 0, 1, 2):
         index = (first + tap).clamp(0, source - 1)
-        value = _cubic(positions - (first + tap))
-        weights = weights + torch.where(columns == index[:, None], value[:, None], torch.zeros_like(value)[:, None])
-    return weights
+        value = _cubic(positions - (first + tap))[:, None]
+        weights = weights + torch.where(columns == index[:, None], value, torch.zeros_like(value))
+    return weights.to(like.dtype)
 
 
 def _cubic(x: Tensor) -> Tensor:

@@ -43,7 +43,8 @@ class DepthNetwork(nn.Module):
 
     def scaled_disparity(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h2 w2"]:
         """Inverse depth at the finest scale: what published evaluation resizes before it inverts."""
-        return self.settings.depth_range.scaled(self(images)[0][:, 0])
+        finest: Tensor = self(images)[0][:, 0]
+        return self.settings.depth_range.scaled(finest)
 
     def depth(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h2 w2"]:
         """Depth at the finest scale, relative."""
