@@ -82,7 +82,7 @@ def _followed(clip: SyntheticClip, source: int, target: int) -> npt.NDArray[np.f
         part = clip.mover[source] == index + 1
         motion = path[target] @ np.linalg.inv(path[source])
         world[part] = world[part] @ motion[:3, :3].T + motion[:3, 3]
-    return world
+    return np.asarray(world, np.float64)
 
 
 def _seen(

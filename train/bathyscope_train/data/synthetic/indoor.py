@@ -44,7 +44,7 @@ class _Site(NamedTuple):
     y: float
 
 
-def indoor(random: np.random.Generator, _: MaterialRanges) -> Scene:
+def indoor(random: np.random.Generator, _material: MaterialRanges) -> Scene:
     """A kitchen, office or desk; its paints are not those of tissue."""
     half = random.uniform((1.4, 1.15, 1.6), (2.8, 1.5, 3.2)) * METRE
     floor = float(half[1])

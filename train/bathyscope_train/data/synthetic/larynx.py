@@ -15,7 +15,7 @@ _EXTENT_MM = 62.0
 _FOLDS_MM = 58.0  # depth of the true vocal folds
 
 
-def _rise(value: Array) -> Array:
+def _rise(value: npt.NDArray[np.floating]) -> Array:
     """Smooth step from 0 to 1 over the unit interval."""
     inside = np.clip(value, 0.0, 1.0)
     return np.asarray(inside * inside * (3.0 - 2.0 * inside), np.float32)

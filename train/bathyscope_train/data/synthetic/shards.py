@@ -77,7 +77,7 @@ def read_clip(path: Path) -> SyntheticClip:
         raise DatasetError(f"{path}: not a rendered clip: {error}") from error
 
 
-def _swell_arrays(swell: Swell | None) -> dict[str, np.ndarray[tuple[int, ...], np.dtype[np.float64]]]:
+def _swell_arrays(swell: Swell | None) -> dict[str, Any]:
     """The swell's numbers under names of their own; nothing where the tissue stands still."""
     if swell is None:
         return {}

@@ -56,7 +56,8 @@ def pattern(kind: int, u: float, v: float, seed: int) -> float:
         board = int(np.floor(0.5 * v))
         rings = value_noise(0.12 * u + 7.0 * board, 2.5 * v, seed) * 5.0
         seam = 1.0 if 0.5 * v - board < 0.03 else 0.0
-        return max(seam, 0.7 * (rings - np.floor(rings)) + 0.3 * scatter(board, seed, 3))
+        tone: float = 0.7 * (rings - np.floor(rings)) + 0.3 * scatter(board, seed, 3)
+        return max(seam, tone)
     if kind == TILES:
         i, j = int(np.floor(u)), int(np.floor(v))
         joint = u - i < 0.06 or v - j < 0.06

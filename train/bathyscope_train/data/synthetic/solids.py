@@ -115,10 +115,12 @@ NO_SOLIDS = make_solids([])
 def joined(still: Solids, moving: Solids) -> Solids:
     """Both tables in one, lit as ``still`` is."""
     return still._replace(
-        **{
-            name: np.concatenate([getattr(still, name), getattr(moving, name)])
-            for name in ("kind", "local_from_scene", "size", "bound", "look", "mover")
-        }
+        kind=np.concatenate([still.kind, moving.kind]),
+        local_from_scene=np.concatenate([still.local_from_scene, moving.local_from_scene]),
+        size=np.concatenate([still.size, moving.size]),
+        bound=np.concatenate([still.bound, moving.bound]),
+        look=np.concatenate([still.look, moving.look]),
+        mover=np.concatenate([still.mover, moving.mover]),
     )
 
 

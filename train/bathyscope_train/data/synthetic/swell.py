@@ -95,17 +95,17 @@ def swollen(surface: Surface, swell: Swell, frame: float) -> Surface:
 def carried(swell: Swell, points: Array, source: float, target: float) -> Array:
     """Where points of the surface, seen in frame ``source``, are in frame ``target``; ``(..., 3)``, in the world."""
     turn, shift = swell.scene_from_world[:3, :3], swell.scene_from_world[:3, 3]
-    scene = points @ turn.T + shift
+    scene = np.asarray(points @ turn.T + shift, np.float64)
     moved = scene.copy()
     if swell.kind == FIELD:
-        at = scene[..., 1], scene[..., 0]
-        moved[..., 2] += gain(swell, *at, target) - gain(swell, *at, source)
+        y, x = scene[..., 1], scene[..., 0]
+        moved[..., 2] += gain(swell, y, x, target) - gain(swell, y, x, source)
     else:
         rows = swell.first + swell.step * np.arange(len(swell.centre))
         middle = np.stack([np.interp(scene[..., 2], rows, swell.centre[:, axis]) for axis in range(2)], axis=-1)
         out = scene[..., :2] - middle
         reach = np.linalg.norm(out, axis=-1)
-        at = scene[..., 2], np.arctan2(out[..., 1], out[..., 0])
-        grown = reach + gain(swell, *at, target) - gain(swell, *at, source)
+        angle = np.asarray(np.arctan2(out[..., 1], out[..., 0]), np.float64)
+        grown = reach + gain(swell, scene[..., 2], angle, target) - gain(swell, scene[..., 2], angle, source)
         moved[..., :2] = middle + out * (grown / np.maximum(reach, 1e-9))[..., None]
     return np.asarray((moved - shift) @ turn)
