@@ -17,14 +17,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, Field, PositiveFloat, PositiveInt, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, Field, PositiveInt, ValidationError, field_validator, model_validator
 
 from bathyscope.errors import BundleError
 from bathyscope.external_data import external_locations
+from bathyscope.model_spec import Kind, ModelSpec
 from bathyscope.result import BundleId
 from bathyscope.zip_errors import ZIP_ERRORS
 
-BUNDLE_FORMAT = 1
+BUNDLE_FORMAT = 2
 """The newest bundle format that this build reads."""
 MANIFEST = "bundle.json"
 MAX_MANIFEST_BYTES = 1 << 20
@@ -33,6 +34,8 @@ MAX_GRAPH_BYTES = 1 << 29
 
 _PLAIN_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,127}")
 Role = Literal["backbone", "heads", "cameras"]
+ROLES: dict[Kind, tuple[Role, ...]] = {"scene": ("backbone", "heads", "cameras"), "video": ("backbone", "heads")}
+"""Graphs that a bundle of each kind holds, in the order in which they run."""
 
 
 class _Strict(BaseModel, frozen=True, extra="forbid"):
@@ -51,7 +54,10 @@ class GraphSpec(_Strict):
 
     ``backbone`` takes ``images`` (t, 3, h, w) in [0, 1] and returns feature maps; ``heads`` takes ``images`` and
     some of these, frame by frame, and returns ``depth`` and ``confidence`` (t, h, w) and ``gaussians``
-    (t, c, h, w), raw; ``cameras`` takes what its inputs name and returns ``pose_encoding`` (t, 9).
+    (t, c, h, w), raw, where the network has any; ``cameras`` takes what its inputs name, among them maybe ``focal``
+    (1,) in pixels (0: not known), and returns ``pose_encoding`` (t, 9) and, where it corrects depth by the motion
+    between the frames, ``refined_depth`` (t, h, w). A video network has no ``cameras``, and its ``heads`` return
+    ``values`` (t, h, w).
     """
 
     file: str
@@ -59,45 +65,13 @@ class GraphSpec(_Strict):
     outputs: tuple[str, ...]
 
 
-class InputSpec(_Strict):
-    """What the network wants to be fed."""
-
-    patch: PositiveInt = Field(description="Height and width must be multiples of this.")
-    pixels: PositiveInt = Field(description="Area (height x width) that the network works best at.")
-    window: PositiveInt = Field(description="Frames the network sees at once.")
-    overlap: PositiveInt = Field(description="Frames that neighbouring windows share.")
-
-    @model_validator(mode="after")
-    def _windows_advance(self) -> InputSpec:
-        if self.overlap >= self.window:
-            raise ValueError(f"overlap ({self.overlap}) must be smaller than window ({self.window})")
-        return self
-
-
-class SceneSpec(_Strict):
-    """How raw network outputs become cameras and Gaussians."""
-
-    pixel_centre: float = Field(ge=0, le=0.5, description="Where in a pixel its depth is unprojected; AnySplat: 0.")
-    focal_epsilon: float = Field(ge=0, le=0.1, description="Added to tan(fov / 2); AnySplat 1e-3, VGGT 0.")
-    activation: Literal["anysplat", "footprint"]
-    sh_degree: int = Field(ge=0, le=4)
-    voxel_size: PositiveFloat | None = Field(default=None, description="Fuse Gaussians in cubes of this side.")
-    opacity_exponent: float = Field(default=0.0, description="x of AnySplat's opacity mapping; 0 is no mapping.")
-
-
-class BundleManifest(_Strict):
+class BundleManifest(ModelSpec):
     """``bundle.json``."""
 
     format: PositiveInt = BUNDLE_FORMAT
-    name: str
-    version: str
-    preset: str
     graphs: dict[Role, GraphSpec]
     weights: str
     files: dict[str, FileEntry]
-    input: InputSpec
-    scene: SceneSpec
-    licence: str
     research_only: bool
     training: dict[str, Any] = Field(default_factory=dict, description="Data, settings and seeds of the weights.")
     parity: list[dict[str, Any]] = Field(default_factory=list, description="Differences from torch, by clip shape.")
@@ -120,7 +94,7 @@ class BundleManifest(_Strict):
         missing = {self.weights, *(graph.file for graph in self.graphs.values())} - set(self.files)
         if missing:
             raise ValueError(f"{sorted(missing)} are used but have no entry in 'files'")
-        roles = {"backbone", "heads", "cameras"} - set(self.graphs)
+        roles = set(ROLES[self.kind]) - set(self.graphs)
         if roles:
             raise ValueError(f"graphs {sorted(roles)} are missing")
         return self

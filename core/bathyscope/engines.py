@@ -7,19 +7,29 @@ video order, and after the last of them what they mean.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Protocol, cast
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, PositiveInt
 
 from bathyscope.bundle import Bundle
 from bathyscope.clip import FrameSequence
 from bathyscope.errors import SettingsError
-from bathyscope.result import DepthKind, FrameDepth, ResultMeta
+from bathyscope.model_spec import ModelSpec
+from bathyscope.result import BundleId, DepthKind, FrameDepth, ResultMeta
+from bathyscope.scene import WindowMaps
 
 ENGINE_GROUP = "bathyscope.engines"
+F32 = NDArray[np.float32]
+
+
+def keep_going() -> None:
+    """The default of ``checkpoint``: nothing stops the run."""
 
 
 class DepthOptions(BaseModel, frozen=True, extra="forbid"):
@@ -28,9 +38,38 @@ class DepthOptions(BaseModel, frozen=True, extra="forbid"):
     stride: PositiveInt = 1
     """Use every n-th frame of the source."""
     depth: DepthKind = "rendered"
-    """Depth rendered from the scene of Gaussians (expected, or accumulated), or the depth head's own."""
+    """Depth rendered from the scene of Gaussians (expected, or accumulated), or the depth head's own. A network without
+    Gaussians has only the latter, and the result says so."""
     max_frames: PositiveInt | None = None
     """Stop after this many frames of the result."""
+
+
+class WindowModel(Protocol):
+    """A scene network that sees a window of frames at once."""
+
+    def predict(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> WindowMaps:
+        """Maps and pose encodings of frames (t, 3, h, w) in [0, 1]; safe to call from several threads.
+
+        Args:
+            images: h and w multiples of the network's patch.
+            checkpoint: Called between the parts of the work; an exception from it ends the run.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ModelInMemory:
+    """A scene network that runs in this process, with what a bundle's manifest would say of it."""
+
+    manifest: ModelSpec
+    digest: str
+    """SHA-256 of its weights."""
+    model: WindowModel
+
+    @property
+    def id(self) -> BundleId:
+        """Name, version and digest, as results carry them."""
+        return BundleId(name=self.manifest.name, version=self.manifest.version, digest=self.digest)
 
 
 class DepthRun(Protocol):
@@ -63,7 +102,7 @@ class Engine(Protocol):
     """A loaded model."""
 
     @property
-    def bundle(self) -> Bundle:
+    def bundle(self) -> Bundle | ModelInMemory:
         """The model in use."""
         ...
 
@@ -85,8 +124,8 @@ class Engine(Protocol):
 class EngineFactory(Protocol):
     """What an entry point of the group ``bathyscope.engines`` names."""
 
-    def __call__(self, bundle: Bundle, /) -> Engine:
-        """Load a bundle with the engine's default settings."""
+    def __call__(self, bundle: Bundle | ModelInMemory, /) -> Engine:
+        """Load a bundle, or take a network that is loaded already, with the engine's default settings."""
         ...
 
 

@@ -5,16 +5,16 @@ The world is that of the window's first camera: pose 0 is the identity, and the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.bundle import SceneSpec
 from bathyscope.camera import F64, Size, invert_pose, quaternion_to_matrix, rebase
 from bathyscope.errors import GeometryError
 from bathyscope.gaussian_parameters import anysplat_gaussians, footprint_gaussians, fuse_voxels, move_gaussians
 from bathyscope.gaussians import Gaussians, concatenate
+from bathyscope.model_spec import SceneSpec
 
 F32 = NDArray[np.float32]
 
@@ -31,8 +31,8 @@ class WindowMaps:
     """(t, h, w) z-depth."""
     confidence: F32
     """(t, h, w)"""
-    gaussians: F32
-    """(t, g, h, w) raw channels."""
+    gaussians: F32 | None
+    """(t, g, h, w) raw channels; ``None`` from a network that has none."""
     pose_encoding: F32
     """(t, 9) translation, quaternion (x, y, z, w), vertical and horizontal field of view; camera from world."""
 
@@ -42,11 +42,13 @@ class WindowMaps:
         for name, shape in wanted.items():
             if getattr(self, name).shape != shape:
                 raise GeometryError(f"{name} must have shape {shape}, got {getattr(self, name).shape}")
-        g = self.gaussians.shape[1] if self.gaussians.ndim == 4 else 0
-        if self.gaussians.shape != (t, g, h, w) or g < 12 or (g - 9) % 3:
-            raise GeometryError(f"gaussians must have shape ({t}, 9 + 3 k, {h}, {w}), got {self.gaussians.shape}")
+        if self.gaussians is not None:
+            g = self.gaussians.shape[1] if self.gaussians.ndim == 4 else 0
+            if self.gaussians.shape != (t, g, h, w) or g < 12 or (g - 9) % 3:
+                raise GeometryError(f"gaussians must have shape ({t}, 9 + 3 k, {h}, {w}), got {self.gaussians.shape}")
         for name in ("depth", "confidence", "gaussians", "pose_encoding"):
-            bad = ~np.isfinite(getattr(self, name))
+            values = getattr(self, name)
+            bad = ~np.isfinite(values) if values is not None else np.zeros(0, np.bool_)
             if bad.any():
                 raise GeometryError(f"the network's {name} has {int(bad.sum())} values that are not finite")
         if (self.depth <= 0).any():
@@ -134,20 +136,26 @@ def assemble_scene(
         first_is_identity: Re-express everything in the first camera's world. Off, the world is the network's own.
 
     Raises:
-        GeometryError: If the encodings are no cameras, or the shapes do not fit.
+        GeometryError: If the encodings are no cameras, the shapes do not fit, or there are no Gaussians.
     """
     cameras = decode_cameras(maps.pose_encoding, maps.size, spec.focal_epsilon)
     points = unproject_window(maps.depth, cameras, spec.pixel_centre)
     keep = np.ones(maps.depth.shape, np.bool_) if valid is None else valid
     if keep.shape != maps.depth.shape or images.shape != (len(keep), 3, *maps.size):
         raise GeometryError(f"maps {maps.depth.shape} do not fit images {images.shape} and valid {keep.shape}")
+    raw = maps.gaussians
+    if raw is None:
+        raise GeometryError("a scene needs Gaussians; this network has none")
     if not colour:
-        maps = replace(maps, gaussians=np.concatenate([maps.gaussians[:, :11], maps.gaussians[:, -1:]], 1))
+        raw = np.concatenate([raw[:, :11], raw[:, -1:]], 1)
     if spec.activation == "anysplat":
-        gaussians = _fused(maps, points, keep, spec)
+        gaussians = _fused(raw, points, keep, spec)
     else:
         gaussians = concatenate(
-            [_of_frame(maps, images, cameras, points, frame=frame, inside=keep[frame]) for frame in range(len(keep))]
+            [
+                _of_frame(raw[t], maps.depth[t], images[t], points[t], cameras=cameras, t=t, inside=keep[t])
+                for t in range(len(keep))
+            ]
         )
     if not first_is_identity:
         return Scene(cameras, gaussians)
@@ -156,23 +164,23 @@ def assemble_scene(
     return Scene(moved, move_gaussians(gaussians, first))
 
 
-def _fused(maps: WindowMaps, points: F64, keep: NDArray[np.bool_], spec: SceneSpec) -> Gaussians:
-    raw = maps.gaussians.transpose(0, 2, 3, 1)[keep]
-    means, features, confidence = points[keep], raw[:, :-1], raw[:, -1]
+def _fused(raw: F32, points: F64, keep: NDArray[np.bool_], spec: SceneSpec) -> Gaussians:
+    kept = raw.transpose(0, 2, 3, 1)[keep]
+    means, features, confidence = points[keep], kept[:, :-1], kept[:, -1]
     if spec.voxel_size is not None:
         means, features = fuse_voxels(means, features, confidence, spec.voxel_size)
     return anysplat_gaussians(means, features, opacity_exponent=spec.opacity_exponent)
 
 
 def _of_frame(
-    maps: WindowMaps, images: F32, cameras: Cameras, points: F64, *, frame: int, inside: NDArray[np.bool_]
+    raw: F32, depth: F32, image: F32, points: F64, *, cameras: Cameras, t: int, inside: NDArray[np.bool_]
 ) -> Gaussians:
-    k = cameras.intrinsics[frame]
+    k = cameras.intrinsics[t]
     pixel = (1 / k[0, 0] + 1 / k[1, 1]) / 2
     return footprint_gaussians(
-        points[frame][inside],
-        maps.gaussians[frame].transpose(1, 2, 0)[inside][:, :-1],
-        footprint=(maps.depth[frame][inside] * pixel).astype(np.float32),
-        colours=images[frame].transpose(1, 2, 0)[inside],
-        rotation=cameras.world_from_camera[frame, :3, :3],
+        points[inside],
+        raw.transpose(1, 2, 0)[inside][:, :-1],
+        footprint=(depth[inside] * pixel).astype(np.float32),
+        colours=image.transpose(1, 2, 0)[inside],
+        rotation=cameras.world_from_camera[t, :3, :3],
     )

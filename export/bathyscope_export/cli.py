@@ -37,7 +37,7 @@ def export(  # noqa: PLR0917 - typer: one parameter an option
     The graphs are compared with PyTorch at several clip lengths and sizes; a bundle that differs is not written.
     Takes minutes. Prints the bundle's path.
     """
-    from bathyscope.bundle import InputSpec
+    from bathyscope.model_spec import InputSpec
     from bathyscope_export.writer import BundleSettings, write_bundle
     from bathyscope_train.model.checkpoints import load_network, training_of
     from bathyscope_train.model.presets import get_preset

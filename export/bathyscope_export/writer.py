@@ -13,13 +13,12 @@ from bathyscope.bundle import (
     Bundle,
     BundleManifest,
     GraphSpec,
-    InputSpec,
     Role,
-    SceneSpec,
     hash_file,
     write_manifest,
 )
 from bathyscope.errors import BundleError
+from bathyscope.model_spec import InputSpec, SceneSpec
 from bathyscope_export.card import write_card
 from bathyscope_export.graph import export_stage
 from bathyscope_export.parity import SHAPES, compare

@@ -11,7 +11,7 @@ from fastapi.responses import JSONResponse, Response
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
-from bathyscope.errors import BathyscopeError, ClipError
+from bathyscope.errors import BathyscopeError, ClipError, SettingsError
 
 MEDIA_TYPE = "application/problem+json"
 _TYPE = "urn:bathyscope:problem:"
@@ -56,8 +56,9 @@ def as_problem(error: BaseException) -> ProblemError:
     match error:
         case ProblemError():
             return error
-        case ClipError():
-            return ProblemError(_UNPROCESSABLE, "clip-unusable", str(error))
+        case ClipError() | SettingsError():
+            code = "clip-unusable" if isinstance(error, ClipError) else "option-does-not-apply"
+            return ProblemError(_UNPROCESSABLE, code, str(error))
         case HTTPException():
             return ProblemError(error.status_code, _code(error.status_code), _sentence(error), headers=_headers(error))
         case RequestValidationError():

@@ -4,36 +4,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import onnxruntime as ort
 from numpy.typing import NDArray
 
 from bathyscope.bundle import Bundle, BundleManifest, GraphSpec, Role
+from bathyscope.engines import keep_going
 from bathyscope.errors import BundleError, GeometryError
 from bathyscope.scene import WindowMaps
 from bathyscope_serve.engine_settings import EngineSettings
 
 F32 = NDArray[np.float32]
 Tensors = dict[str, NDArray[Any]]
-
-
-def keep_going() -> None:
-    """The default of ``checkpoint``: nothing stops the run."""
-
-
-class DepthModel(Protocol):
-    """A network that sees a window of frames at once."""
-
-    def predict(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> WindowMaps:
-        """Maps and pose encodings of frames (t, 3, h, w) in [0, 1]; safe to call from several threads.
-
-        Args:
-            images: h and w multiples of the bundle's patch.
-            checkpoint: Called between the parts of the work; an exception from it ends the run.
-        """
-        ...
 
 
 class OnnxModel:
@@ -50,7 +34,7 @@ class OnnxModel:
         self._sessions = {role: _load(bundle, role, options) for role in bundle.manifest.graphs}
 
     def predict(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> WindowMaps:
-        """See :class:`DepthModel`.
+        """See :class:`~bathyscope.engines.WindowModel`.
 
         Raises:
             GeometryError: If the outputs are not finite or of the wrong shape.
@@ -63,10 +47,15 @@ class OnnxModel:
         checkpoint()
         known |= self._run("cameras", known)
         t, h, w = len(images), *images.shape[2:]
-        maps = {name: known[name] for name in ("depth", "confidence", "gaussians", "pose_encoding")}
-        if maps["depth"].shape != (t, h, w):
-            raise GeometryError(f"the network's depth has shape {maps['depth'].shape}, {(t, h, w)} was needed")
-        return WindowMaps(**{name: np.asarray(value, np.float32) for name, value in maps.items()})
+        if known["depth"].shape != (t, h, w):
+            raise GeometryError(f"the network's depth has shape {known['depth'].shape}, {(t, h, w)} was needed")
+        gaussians = known.get("gaussians")
+        return WindowMaps(
+            depth=np.asarray(known["depth"], np.float32),
+            confidence=np.asarray(known["confidence"], np.float32),
+            gaussians=None if gaussians is None else np.asarray(gaussians, np.float32),
+            pose_encoding=np.asarray(known["pose_encoding"], np.float32),
+        )
 
     def _heads(self, known: Tensors, checkpoint: Callable[[], None]) -> Tensors:
         """Dense heads, a few frames at a time: their activations are the other peak of memory."""

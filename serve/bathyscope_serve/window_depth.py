@@ -9,8 +9,8 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.bundle import SceneSpec
 from bathyscope.camera import F64, invert_pose, rebase
+from bathyscope.model_spec import SceneSpec
 from bathyscope.result import DepthKind
 from bathyscope.scene import WindowMaps, assemble_scene, decode_cameras
 from bathyscope.splat import prepare, render

@@ -20,13 +20,12 @@ from bathyscope.bundle import (
     BundleManifest,
     FileEntry,
     GraphSpec,
-    InputSpec,
-    SceneSpec,
     hash_file,
     shipped_bundle,
     write_manifest,
 )
 from bathyscope.errors import BundleError
+from bathyscope.model_spec import InputSpec, SceneSpec
 
 GRAPHS = {"backbone": "backbone.onnx", "heads": "heads.onnx", "cameras": "cameras.onnx"}
 

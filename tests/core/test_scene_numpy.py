@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bathyscope.bundle import SceneSpec
 from bathyscope.camera import invert_pose, quaternion_to_matrix, unproject
 from bathyscope.errors import GeometryError
 from bathyscope.gaussian_parameters import fuse_voxels, map_opacity, rotate_harmonics
 from bathyscope.gaussians import Gaussians
+from bathyscope.model_spec import SceneSpec
 from bathyscope.scene import WindowMaps, assemble_scene, decode_cameras
 from bathyscope.splat import render
 

@@ -15,8 +15,9 @@ from bathyscope.clip import Clip
 from bathyscope.engines import DepthOptions, engine_factory
 from bathyscope.errors import ClipError, GeometryError
 from bathyscope.result import ClipDepth
-from bathyscope_serve.engine import DepthEngine, StoppedError
+from bathyscope_serve.engine import DepthEngine
 from bathyscope_serve.engine_settings import EngineSettings
+from bathyscope_serve.session import StoppedError
 
 HEAD = DepthOptions(depth="head")
 MODEL_SIZE = (42, 56)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from bathyscope.bundle import InputSpec
+from bathyscope.model_spec import InputSpec
 from bathyscope.vision.field_of_view import FieldOfView, find_field_of_view
 from bathyscope.vision.grid import Grid, choose_size
 from bathyscope_serve.isolation import open_source

@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.bundle import SceneSpec
 from bathyscope.camera import invert_pose, pixel_grid, rebase
 from bathyscope.clip import Clip
+from bathyscope.model_spec import SceneSpec
 from bathyscope.scene import WindowMaps
 
 PLANE_NORMAL = np.array([0.2, -0.1, 1.0])

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.bundle import InputSpec
 from bathyscope.camera import F64, Size, crop_intrinsics, scale_intrinsics
+from bathyscope.model_spec import InputSpec
 from bathyscope.vision.field_of_view import FieldOfView, Mask
 
 F32 = NDArray[np.float32]

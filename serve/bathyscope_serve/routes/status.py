@@ -7,7 +7,7 @@ from typing import Literal
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
-from bathyscope.bundle import BundleManifest
+from bathyscope.bundle import Bundle, BundleManifest
 from bathyscope_serve.problems import MEDIA_TYPE, ProblemError
 from bathyscope_serve.service import DepthService
 
@@ -52,4 +52,6 @@ async def readiness(request: Request) -> Health:
 async def bundle(request: Request) -> BundleInfo:
     """The model in use: hashes, provenance, licence, parity and accuracy."""
     service: DepthService = request.app.state.service
-    return BundleInfo(digest=service.engine.bundle.digest, manifest=service.engine.bundle.manifest)
+    model = service.engine.bundle
+    assert isinstance(model, Bundle), "a service runs a bundle"
+    return BundleInfo(digest=model.digest, manifest=model.manifest)

@@ -1,0 +1,112 @@
+"""A clip through a scene network: windows, one world each, splatted into every frame and brought together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from bathyscope.engines import WindowModel
+from bathyscope.errors import SettingsError
+from bathyscope.model_spec import SceneSpec
+from bathyscope.result import DepthKind, FrameDepth
+from bathyscope.vision.field_of_view import FieldOfView
+from bathyscope.vision.grid import Grid
+from bathyscope_serve.frames import FrameSource
+from bathyscope_serve.session import DepthSession, Job, SmallFrame
+from bathyscope_serve.stitch import SmallDepth, Stitcher
+from bathyscope_serve.window_depth import Map, render_window
+from bathyscope_serve.windows import Window, cut_windows
+
+
+class SceneSession(DepthSession):
+    """A run of a scene network.
+
+    Args:
+        job: What to work on.
+        model: The network.
+        scene: How its outputs become a scene.
+        renderers: Maps frames to rendered frames, maybe in threads.
+
+    Raises:
+        SettingsError: If depth is asked for that the network cannot give.
+    """
+
+    def __init__(self, job: Job, model: WindowModel, scene: SceneSpec, renderers: Map) -> None:
+        super().__init__(job, _depth_kind(job, scene))
+        self._model, self._scene, self._renderers = model, scene, renderers
+
+    def _estimates(self, source: FrameSource, field_of_view: FieldOfView) -> Iterator[FrameDepth]:
+        grid = Grid.fit(field_of_view, self._job.input)
+        stitcher = Stitcher(self._job.input.overlap, self._job.settings.stitch)
+        try:
+            for small in self._stitched(source, grid, stitcher):
+                with self._timed("upsample"):
+                    frame = _at_source_size(small, grid)
+                yield frame
+        finally:
+            self._warnings.extend(stitcher.warnings)
+
+    def _stitched(self, source: FrameSource, grid: Grid, stitcher: Stitcher) -> Iterator[SmallDepth]:
+        """Frames of the result at the network's size, as they become final."""
+        wanted = self._job.input
+        frames = self._frames(source, grid.to_model, grid.inside)
+        for window in cut_windows(frames, wanted.window, wanted.overlap):
+            depth = self._depth(window, grid)
+            with self._timed("stitch"):
+                final = list(stitcher.add(depth, window.shared))
+            yield from final
+        yield from stitcher.finish()
+
+    def _depth(self, window: Window[SmallFrame], grid: Grid) -> list[SmallDepth]:
+        images = np.stack([frame.image for frame in window.items])
+        with self._timed("network"):
+            maps = self._model.predict(images, self._checkpoint)
+        with self._timed("splat"):
+            views = render_window(
+                maps,
+                images,
+                self._scene,
+                inside=grid.inside,
+                depth=self._depth_kind,
+                least_opacity=self._job.settings.least_opacity,
+                run=self._renderers,
+            )
+        self._checkpoint()
+        return [
+            SmallDepth(
+                index=frame.index,
+                timestamp_s=frame.timestamp_s,
+                depth=view.depth,
+                confidence=view.confidence,
+                known=grid.inside & (view.depth > 0),
+                world_from_camera=view.world_from_camera,
+                intrinsics=view.intrinsics,
+            )
+            for frame, view in zip(window.items, views, strict=True)
+        ]
+
+
+def _depth_kind(job: Job, scene: SceneSpec) -> DepthKind:
+    """Which depth to give: without Gaussians there is only the head's."""
+    wanted = job.options.depth
+    if scene.gaussians:
+        return wanted
+    if wanted == "accumulated":
+        raise SettingsError(f"{job.bundle.name} has no Gaussians to accumulate; ask for 'head' depth")
+    return "head"
+
+
+def _at_source_size(small: SmallDepth, grid: Grid) -> FrameDepth:
+    depth, valid = grid.to_source(small.depth, small.known)
+    confidence, _ = grid.to_source(small.confidence, small.known)
+    return FrameDepth(
+        index=small.index,
+        timestamp_s=small.timestamp_s,
+        depth=depth,
+        confidence=confidence,
+        valid=valid,
+        world_from_camera=small.world_from_camera,
+        intrinsics=grid.intrinsics_to_source(small.intrinsics),
+        segment=small.segment,
+    )
