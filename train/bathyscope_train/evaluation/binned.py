@@ -46,10 +46,10 @@ class BinnedErrors:
             least: Bins with a smaller share of all pixels are left out.
         """
         keep = self.counts > least * self.counts.sum()
-        edges = (np.arange(_BINS + 1, dtype=np.uint32) << _BITS).view(np.float32).astype(np.float64)
-        middle = (edges[:-1] + edges[1:]) / 2
+        bins = np.flatnonzero(keep)
+        low, high = ((np.asarray(b, np.uint32) << _BITS).view(np.float32).astype(np.float64) for b in (bins, bins + 1))
         n = self.counts[keep]
-        return middle[keep], self.absolute[keep] / n, self.signed[keep] / n
+        return (low + high) / 2, self.absolute[keep] / n, self.signed[keep] / n
 
     def as_dict(self) -> dict[str, list[float]]:
         """For JSON: only bins that hold pixels."""

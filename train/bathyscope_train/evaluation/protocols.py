@@ -79,7 +79,7 @@ class Protocol:
     """Whether the data set's published crop is cut out of images and truth."""
     temporal: Literal["endodav", "vda"] | None = "endodav"
     """Which temporal error to report where poses are known."""
-    scared_split: Literal["video_test", "af_test_551"] = "video_test"
+    scared_split: Literal["video-test", "endovis-test"] = "video-test"
     columns: tuple[str, ...] = SEVEN_COLUMNS
     """Errors of the summary table, in its order; all seven are always in the CSV."""
     quirks: frozenset[Quirk] = frozenset()
@@ -136,7 +136,7 @@ PROTOCOLS: dict[str, Protocol] = {
             resize="disparity",
             crop=True,
             temporal=None,
-            scared_split="af_test_551",
+            scared_split="endovis-test",
         ),
         Protocol(
             name="vda",

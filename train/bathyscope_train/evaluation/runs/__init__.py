@@ -1,0 +1,1 @@
+"""Whole evaluations: many systems on many data sets, resumable, with tables, plots and comparisons."""
