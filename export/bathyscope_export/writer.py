@@ -18,14 +18,14 @@ from bathyscope.bundle import (
     write_manifest,
 )
 from bathyscope.errors import BundleError
-from bathyscope.model_spec import InputSpec, SceneSpec
+from bathyscope.model_spec import InputSpec
 from bathyscope_export.card import write_card
 from bathyscope_export.graph import export_stage
 from bathyscope_export.parity import SHAPES, compare
 from bathyscope_export.stages import split
 from bathyscope_export.weights import externalise
 from bathyscope_train.model.network import Network
-from bathyscope_train.model.presets import SceneSettings
+from bathyscope_train.model.specs import scene_spec
 
 WEIGHTS = "weights.bin"
 CARD = "card.md"
@@ -106,7 +106,7 @@ def _fill(network: Network, folder: Path, settings: BundleSettings, progress: Ca
         weights=WEIGHTS,
         files={name: hash_file(folder / name) for name in names},
         input=settings.input,
-        scene=scene_spec(network.preset.scene, degree=network.preset.harmonic_degree),
+        scene=scene_spec(network.preset),
         licence=settings.licence,
         research_only=settings.research_only,
         training=training,
@@ -135,24 +135,6 @@ def write_graphs(
             outputs=tuple(value.name for value in model.graph.output),
         )
     return specs
-
-
-def scene_spec(scene: SceneSettings, *, degree: int) -> SceneSpec:
-    """The preset's reading of the raw maps, as the manifest says it.
-
-    Raises:
-        BundleError: If pixels are neither unprojected at their centre nor at their corner.
-    """
-    if scene.pixel_center not in (0.0, 0.5):
-        raise BundleError(f"a bundle unprojects pixels at 0 or 0.5, this preset at {scene.pixel_center}")
-    return SceneSpec(
-        pixel_centre=0.0 if scene.pixel_center == 0.0 else 0.5,
-        focal_epsilon=scene.focal_epsilon,
-        activation=scene.activation,
-        sh_degree=degree,
-        voxel_size=scene.voxel_size,
-        opacity_exponent=scene.opacity_exponent,
-    )
 
 
 def strip_paths(value: Any) -> Any:
