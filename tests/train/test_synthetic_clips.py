@@ -36,7 +36,8 @@ def digest(clip: SyntheticClip) -> str:
 
 def always_masked() -> Domain:
     broad = DOMAINS["broad"]
-    return broad.model_copy(update={"sensor": broad.sensor.model_copy(update={"round_view": 1.0, "compressed": 0.0})})
+    sensor = {"round_view": 1.0, "compressed": 0.0, "overlay": 0.0}
+    return broad.model_copy(update={"sensor": broad.sensor.model_copy(update=sensor)})
 
 
 def test_the_same_seed_gives_the_same_bytes_in_another_process() -> None:

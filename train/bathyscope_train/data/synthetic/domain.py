@@ -86,8 +86,8 @@ class MaterialRanges(_Ranges):
     """Other palettes, each as likely for a scene as the one above."""
     regions: Range = (0.0, 0.0)
     """Logarithm of the contrast of large light and dark regions, which have nothing to do with the shape."""
-    region_share: Range = (0.08, 0.5)
-    """Size of such regions against the shorter side of the surface."""
+    region_edge: Range = (0.5, 5.0)
+    """Steepness of their borders: above 2 a region is even inside."""
     banded: Share = 0.0
     """Share of scenes with painted bands, light or dark."""
     bloody: Share = 0.0
@@ -182,38 +182,54 @@ class SensorRanges(_Ranges):
     compressed: Share = 0.0
     """Share of clips that went through JPEG."""
     quality: Range = (60.0, 95.0)
-    hold: Range = (0.0, 0.0)
-    """Mean change in levels below which a block of a compressed video is not sent again."""
-    aperture_mm: Range = (0.0, 0.0)
-    """Opening of the lens, which blurs what is out of focus; 0 is a pinhole."""
-    focus: Range = (0.7, 2.5)
+    held: Share = 0.0
+    """Share of the compressed clips that are video: blocks that hardly change are not sent again."""
+    hold: Range = (0.5, 4.0)
+    """Mean change of such a block in levels."""
+    unfocused: Share = 0.0
+    """Share of clips whose lens blurs what is out of focus."""
+    aperture_mm: Range = (0.05, 0.6)
+    """Opening of the lens."""
+    focus: Range = (0.6, 2.5)
     """Distance in focus, in median depths of the first frame."""
-    shutter: Range = (0.0, 0.0)
-    """Share of the time between two frames that the shutter is open: motion blur."""
+    smeared: Share = 0.0
+    """Share of clips with motion blur."""
+    shutter: Range = (0.15, 0.9)
+    """Share of the time between two frames that the shutter is open."""
     interlaced: Share = 0.0
     """Share of clips whose odd rows show the instant half a frame later."""
-    glare: Range = (0.0, 0.0)
+    glaring: Share = 0.0
+    """Share of clips with glare."""
+    glare: Range = (0.03, 0.2)
     """Share of the light that the lens scatters widely over the image."""
-    fringe_px: Range = (0.0, 0.0)
+    fringed: Share = 0.0
+    """Share of clips with lateral colour."""
+    fringe_px: Range = (0.2, 0.9)
     """How far red and blue part at the sides of an image 140 pixels wide."""
-    warmth: Range = (0.0, 0.0)
-    """Wrong white balance: logarithm of red over blue."""
-    tint: Range = (0.0, 0.0)
-    """Wrong white balance: logarithm of green over the mean of red and blue."""
-    drift: Range = (0.0, 0.0)
+    tinted: Share = 0.0
+    """Share of clips with a wrong white balance."""
+    warmth: Range = (-0.3, 0.3)
+    """Logarithm of red over blue."""
+    tint: Range = (-0.08, 0.06)
+    """Logarithm of green over the mean of red and blue."""
+    drift: Range = (0.0, 0.08)
     """Amplitude with which both wander during a clip."""
-    shot: Range = (0.0, 0.0)
-    """Standard deviation of the photon noise at full light, before the gamma curve; it goes with the root of light."""
-    read: Range = (0.0, 0.0)
-    """Standard deviation of the read-out noise, before the gamma curve."""
-    grain_px: Range = (0.0, 0.0)
+    grainy: Share = 0.0
+    """Share of clips with the noise of a chip in linear light, coloured by demosaicing."""
+    shot: Range = (0.01, 0.06)
+    """Standard deviation of the photon noise at full light; it goes with the root of light."""
+    read: Range = (0.0005, 0.006)
+    """Standard deviation of the read-out noise at full light."""
+    grain_px: Range = (0.0, 0.8)
     """Standard deviation of the blur that demosaicing gives the noise; its colour gets twice that."""
-    chroma: Range = (1.0, 1.0)
+    chroma: Range = (0.2, 1.0)
     """Strength of the noise's colour against its brightness; 1 is independent noise in red, green and blue."""
-    sharpen: Range = (0.0, 0.0)
-    """Strength of the processor's sharpening, which leaves halos."""
+    sharpened: Share = 0.0
+    """Share of clips that the processor sharpens, which leaves halos."""
+    sharpen: Range = (0.2, 1.4)
+    """Strength of the sharpening."""
     sharpen_px: Range = (0.6, 1.6)
-    """Standard deviation of the blur that the sharpening subtracts."""
+    """Standard deviation of the blur that it subtracts."""
     overlay: Share = 0.0
     """Share of clips with writing in the black around a round view."""
 

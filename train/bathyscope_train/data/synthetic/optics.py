@@ -1,6 +1,7 @@
 """From radiance to the eight bits of a video: air, lens, shutter, exposure, curve, noise, compression."""
 
 from dataclasses import dataclass
+from typing import TypedDict
 
 import cv2
 import numpy as np
@@ -65,6 +66,11 @@ class Sensor:
     overlay: Array | None = None
     """``(h, w)``: brightness of the writing outside the view."""
 
+    @property
+    def timed(self) -> bool:
+        """Whether a frame is more than one instant."""
+        return self.shutter > 0 or self.interlaced
+
 
 def draw_sensor(random: np.random.Generator, ranges: SensorRanges, size: tuple[int, int], haze: Haze = CLEAR) -> Sensor:
     """Draw a camera head for images of ``size``."""
@@ -74,7 +80,6 @@ def draw_sensor(random: np.random.Generator, ranges: SensorRanges, size: tuple[i
     blur = draw(random, ranges.blur_px) * scale
     quality = round(draw(random, ranges.quality))
     view = draw_view(random, ranges, size)
-    drift = draw(more, ranges.drift)
     return Sensor(
         gamma=draw(random, ranges.gamma),
         exposure=draw(random, ranges.exposure),
@@ -88,37 +93,67 @@ def draw_sensor(random: np.random.Generator, ranges: SensorRanges, size: tuple[i
         quality=quality if compressed < ranges.compressed else None,
         view=view if masked < ranges.round_view else np.ones(size, np.float32),
         haze=haze,
-        drift=(drift, more.uniform(-0.5, 0.5) * drift, more.uniform(0.0, 2 * np.pi)),
-        aperture_mm=draw(more, ranges.aperture_mm),
+        **_electronics(more, ranges, scale),
+        aperture_mm=_sometimes(more, ranges.unfocused, ranges.aperture_mm),
         focus=draw(more, ranges.focus),
-        shutter=draw(more, ranges.shutter),
+        shutter=_sometimes(more, ranges.smeared, ranges.shutter),
         interlaced=more.uniform() < ranges.interlaced,
-        glare=draw(more, ranges.glare),
-        fringe_px=draw(more, ranges.fringe_px) * scale,
-        balance=(draw(more, ranges.warmth), draw(more, ranges.tint)),
-        shot=draw(more, ranges.shot),
-        read=draw(more, ranges.read),
-        grain_px=draw(more, ranges.grain_px) * scale,
-        chroma=draw(more, ranges.chroma),
-        sharpen=draw(more, ranges.sharpen),
-        sharpen_px=draw(more, ranges.sharpen_px) * scale,
-        hold=draw(more, ranges.hold),
+        glare=_sometimes(more, ranges.glaring, ranges.glare),
+        fringe_px=_sometimes(more, ranges.fringed, ranges.fringe_px) * scale,
+        hold=_sometimes(more, ranges.held, ranges.hold),
         overlay=writing(more, size) if more.uniform() < ranges.overlay else None,
     )
 
 
-def form_image(radiance: Array, depth: Array, motion: Array, focal_px: float, sensor: Sensor) -> Array:
+class _Electronics(TypedDict):
+    balance: tuple[float, float]
+    drift: tuple[float, float, float]
+    shot: float
+    read: float
+    grain_px: float
+    chroma: float
+    sharpen: float
+    sharpen_px: float
+
+
+def _electronics(random: np.random.Generator, ranges: SensorRanges, scale: float) -> _Electronics:
+    """White balance, noise and sharpening; ``scale`` turns pixels of a usual image into those of this one."""
+    tinted, grainy = random.uniform() < ranges.tinted, random.uniform() < ranges.grainy
+    warmth, tint, drift = (draw(random, bounds) for bounds in (ranges.warmth, ranges.tint, ranges.drift))
+    shot, read, grain_px, chroma = (
+        draw(random, bounds) for bounds in (ranges.shot, ranges.read, ranges.grain_px, ranges.chroma)
+    )
+    side, phase = random.uniform(-0.5, 0.5), random.uniform(0.0, 2 * np.pi)
+    return {
+        "balance": (warmth, tint) if tinted else (0.0, 0.0),
+        "drift": (drift, side * drift, phase) if tinted else (0.0, 0.0, 0.0),
+        "shot": shot if grainy else 0.0,
+        "read": read if grainy else 0.0,
+        "grain_px": grain_px * scale if grainy else 0.0,
+        "chroma": chroma if grainy else 1.0,
+        "sharpen": _sometimes(random, ranges.sharpened, ranges.sharpen),
+        "sharpen_px": draw(random, ranges.sharpen_px) * scale,
+    }
+
+
+def _sometimes(random: np.random.Generator, share: float, bounds: tuple[float, float]) -> float:
+    """A number of the range in ``share`` of the draws, else 0."""
+    happens, value = random.uniform() < share, draw(random, bounds)
+    return value if happens else 0.0
+
+
+def form_image(radiance: Array, depth: Array, motion: Array | None, focal_px: float, sensor: Sensor) -> Array:
     """What reaches the chip: the scene through smoke, out of focus, moving while the shutter is open.
 
     Args:
         radiance: ``(t, h, w, 3)``, left as it is.
         depth: ``(t, h, w)`` in millimetres.
-        motion: ``(t, h, w, 2)``: pixels that the content moves until the next frame.
+        motion: ``(t, h, w, 2)``: pixels that the content moves until the next frame; ``None`` is stillness.
         focal_px: Focal length.
         sensor: Camera head; with everything off the radiance itself is returned.
     """
     smoky, deep = sensor.haze.opacity > 0, sensor.aperture_mm > 0
-    if not (smoky or deep or sensor.shutter > 0 or sensor.interlaced):
+    if not (smoky or deep or (sensor.timed and motion is not None)):
         return radiance
     first = depth[0][(sensor.view > 0.5) & (depth[0] > 0)]
     median_mm = float(np.median(first)) if first.size else 1.0
@@ -130,9 +165,9 @@ def form_image(radiance: Array, depth: Array, motion: Array, focal_px: float, se
             light = add_haze(light, depth[index], sensor.haze, index, depth_mm=median_mm, metered=metered)
         if deep:
             light = defocus(light, blur_px(depth[index], focal_px, sensor.aperture_mm, sensor.focus * median_mm))
-        if sensor.shutter > 0:
+        if motion is not None and sensor.shutter > 0:
             light = smear(light, motion[index], sensor.shutter)
-        if sensor.interlaced:
+        if motion is not None and sensor.interlaced:
             light = interlace(light, motion[index])
         formed[index] = light
     return formed
@@ -191,7 +226,7 @@ def develop(random: np.random.Generator, radiance: Array, sensor: Sensor) -> npt
 def _lens(light: Array, sensor: Sensor) -> Array:
     """Glare, coloured fringes and blur of the lens."""
     if sensor.glare > 0:
-        light = scatter(np.minimum(light, _BURNT), sensor.glare)
+        light = scatter(np.minimum(light, _BURNT), sensor.glare) * (sensor.view[..., None] > 0)
     if sensor.fringe_px > 0.05:
         light = part_colours(light, sensor.fringe_px)
     if sensor.blur_px > 0.1:

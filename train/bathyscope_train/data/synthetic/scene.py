@@ -74,6 +74,10 @@ class Tissue(NamedTuple):
     """Slope of the film's relief, which bends and breaks its highlights."""
     dry: float = -3.0
     """Level of the blotches below which the film is gone."""
+    regions: float = 0.0
+    """Logarithm of the contrast of large light and dark regions."""
+    region_edge: float = 1.0
+    region_level: float = 0.0
     fine: float = 0.0
     """Strength of a third, finer octave of blotches and relief."""
     capillaries: float = 0.0

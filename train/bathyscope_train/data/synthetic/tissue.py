@@ -5,6 +5,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bathyscope_train.data.synthetic.domain import MaterialRanges, draw
+from bathyscope_train.data.synthetic.films import Patch, coat_surface
 from bathyscope_train.data.synthetic.noise import gradient_noise, periodic_noise
 from bathyscope_train.data.synthetic.scene import Tissue
 from bathyscope_train.data.synthetic.vessels import vessel_map
@@ -20,6 +21,14 @@ def palette(random: np.random.Generator, material: MaterialRanges) -> Array:
     red = draw(random, material.red)
     green = red * draw(random, material.green_over_red)
     return np.array([red, green, green * draw(random, material.blue_over_green)], np.float32)
+
+
+def settle_palette(random: np.random.Generator, material: MaterialRanges) -> MaterialRanges:
+    """The ranges of one scene: those of the palette that it gets, if there is a choice."""
+    which = int(random.spawn(1)[0].integers(len(material.palettes) + 1))
+    if which == 0:
+        return material
+    return material.model_copy(update=dict(material.palettes[which - 1]))
 
 
 def blend(base: Array, other: Array, share: Array | float) -> Array:
@@ -58,6 +67,8 @@ def make_tissue(
         vessel_step_mm: Resolution of the vessels.
         grain: Size of blotches, relief and vessels against their usual size.
     """
+    films, wetness = random.spawn(2)
+    coating = coat_surface(films, material, albedo, Patch(size_mm, wrap))
     area = size_mm[0] * size_mm[1] / 20_000.0
     trees = max(1, round(draw(random, material.vessels) * area)) if material.vessels[1] > 0 else 0
     level = vessel_map(random, size_mm, vessel_step_mm, trees, wrap=wrap, width=grain)
@@ -67,7 +78,7 @@ def make_tissue(
         levels.append(np.ascontiguousarray(cv2.resize(levels[-1], (columns, rows), interpolation=cv2.INTER_AREA)))
     contrast = draw(random, material.vessel_contrast)
     return Tissue(
-        albedo=np.ascontiguousarray(albedo),
+        albedo=np.ascontiguousarray(coating.albedo),
         vessels=(levels[0], levels[1], levels[2], levels[3]),
         vessel_step_mm=vessel_step_mm,
         vessel_tint=(1.0 - 0.35 * contrast, 1.0 - contrast, 1.0 - 0.95 * contrast),
@@ -78,4 +89,14 @@ def make_tissue(
         bump=draw(random, material.bump),
         specular=draw(random, material.specular),
         shininess=draw(random, material.shininess),
+        gloss=coating.gloss,
+        coat=draw(wetness, material.coat) if wetness.uniform() < material.coated else 0.0,
+        coat_shininess=draw(wetness, material.coat_shininess),
+        coat_bump=draw(wetness, material.coat_bump),
+        dry=draw(wetness, material.dry),
+        regions=draw(wetness, material.regions),
+        region_edge=draw(wetness, material.region_edge),
+        region_level=float(wetness.uniform(-0.7, 0.7)),
+        fine=draw(wetness, material.fine),
+        capillaries=draw(wetness, material.capillaries),
     )
