@@ -21,7 +21,8 @@ def depth_reprojection_loss(
               \Big\rangle_{D_{t'}(u') > 10^{-3}}
 
     This is the two-frame, stride 1, L1 relative of the world-coordinate consistency of the paper. Sampling is bilinear
-    with zeros outside, so that a pixel that leaves the neighbour drops out.
+    with zeros outside, so that a pixel that leaves the neighbour drops out; one that leaves it by less than a pixel is
+    compared with depth that has zeros blended in, as published.
 
     Args:
         depth: Predicted z-depth of every frame.
