@@ -1,4 +1,4 @@
-"""The torch reference renderer against golden images and golden gradients (``splatting/case_*.npz``)."""
+"""The torch renderers against golden images and golden gradients (``splatting/case_*.npz``)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bathyscope.splat import SplatSettings
 from bathyscope_train.model.gaussian_parameters import GaussianBatch
-from bathyscope_train.render import ReferenceRenderer, Rendering
+from bathyscope_train.render import CpuRenderer, ReferenceRenderer, Rendering
 
 REFERENCE = Path(os.environ.get("BATHYSCOPE_REFERENCE", Path(__file__).parents[2] / "../shared/reference"))
 CASES = sorted((REFERENCE / "splatting").glob("case_*.npz"))
@@ -35,7 +35,7 @@ class Pass:
     exact: bool
 
 
-def renderer(data: dict[str, Any]) -> ReferenceRenderer:
+def renderer(data: dict[str, Any], kind: type[ReferenceRenderer | CpuRenderer]) -> ReferenceRenderer | CpuRenderer:
     names = ("near_plane", "far_plane", "eps2d", "alpha_threshold", "transmittance_cutoff", "max_alpha", "radius_clip")
     settings = SplatSettings(
         **{name: float(data[name]) for name in names},
@@ -43,7 +43,7 @@ def renderer(data: dict[str, Any]) -> ReferenceRenderer:
         degree=int(data["sh_degree"]),
     )
     background = tuple(float(value) for value in data.get("background", np.zeros(3)))
-    return ReferenceRenderer(settings, background)
+    return kind(settings, background)
 
 
 def golden_loss(rendering: Rendering, data: dict[str, Any]) -> Tensor:
@@ -68,12 +68,12 @@ def golden_loss(rendering: Rendering, data: dict[str, Any]) -> Tensor:
 
 
 @cache
-def run(path: Path, dtype: torch.dtype) -> Pass:
+def run(path: Path, kind: type[ReferenceRenderer | CpuRenderer], dtype: torch.dtype) -> Pass:
     data = dict(np.load(path))
     leaves = {name: torch.from_numpy(data[name]).to(dtype)[None].requires_grad_() for name in INPUTS}
     scene = GaussianBatch(*(leaves[name] for name in INPUTS[:5]))
     size = int(data["height"]), int(data["width"])
-    rendering = renderer(data).from_cameras(scene, leaves["viewmats"], leaves["Ks"], size)
+    rendering = renderer(data, kind).from_cameras(scene, leaves["viewmats"], leaves["Ks"], size)
     loss = golden_loss(rendering, data)
     loss.backward()
     gradients = {name: leaf.grad[0].numpy() for name, leaf in leaves.items() if leaf.grad is not None}
@@ -85,9 +85,12 @@ def path(request: pytest.FixtureRequest) -> Path:
     return request.param
 
 
-@pytest.fixture(params=[torch.float32, torch.float64], ids=["float32", "float64"])
+@pytest.fixture(
+    params=[(ReferenceRenderer, torch.float32), (ReferenceRenderer, torch.float64), (CpuRenderer, torch.float32)],
+    ids=["reference-float32", "reference-float64", "cpu"],
+)
 def found(path: Path, request: pytest.FixtureRequest) -> Pass:
-    return run(path, request.param)
+    return run(path, *request.param)
 
 
 def images(found: Pass) -> dict[str, np.ndarray]:

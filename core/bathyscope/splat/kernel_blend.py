@@ -85,9 +85,9 @@ def _blocks() -> tuple[Any, Any]:
 COLUMN_MASKS, ROW_MASKS = _masks()
 BLOCKS, BLOCK_COUNTS = _blocks()
 # Centres of the pixels of a tile, block by block, from the corner of the tile.
-_ACROSS = np.array([(b % 2) * 4 + lane % 4 + 0.5 for b in range(8) for lane in range(8)], np.float32)
-_DOWN = np.array([(b // 2) * 2 + lane // 4 + 0.5 for b in range(8) for lane in range(8)], np.float32)
-_EMPTY = np.uint64(0)
+ACROSS = np.array([(b % 2) * 4 + lane % 4 + 0.5 for b in range(8) for lane in range(8)], np.float32)
+DOWN = np.array([(b // 2) * 2 + lane // 4 + 0.5 for b in range(8) for lane in range(8)], np.float32)
+EMPTY = np.uint64(0)
 _FIRST_OF_EACH, _GATHER_BITS = np.uint64(0x0101010101010101), np.uint64(0x0102040810204080)
 
 
@@ -151,7 +151,7 @@ def _box_mask(left: Any, right: Any, top: Any, bottom: Any, row: int, column: in
 
 
 @inlined
-def _blocks_of(mask: Any) -> Any:
+def blocks_of(mask: Any) -> Any:
     """The blocks with a pixel in ``mask``, a bit each."""
     mask |= mask >> np.uint64(4)
     mask |= mask >> np.uint64(2)
@@ -160,18 +160,18 @@ def _blocks_of(mask: Any) -> Any:
 
 
 @inlined
-def _wide_at(array: Any, index: Any) -> Any:
+def wide_at(array: Any, index: Any) -> Any:
     return wide(peek(array, index))
 
 
 @inlined
 def _blend_block(state: Any, place: Any, dx: Any, dy: Any, item: Any, at: Any, camera: Any, coloured: bool) -> None:
     """Blend the Gaussian at ``at`` of ``item`` into the eight pixels at ``place``, whose centres are (dx, dy)."""
-    dx, dy = dx - _wide_at(item, at + U * 8), dy - _wide_at(item, at + V * 8)
-    p = madd(dx, _wide_at(item, at + L0 * 8), dy * peek(item, at + L1 * 8))
+    dx, dy = dx - wide_at(item, at + U * 8), dy - wide_at(item, at + V * 8)
+    p = madd(dx, wide_at(item, at + L0 * 8), dy * peek(item, at + L1 * 8))
     q = dy * peek(item, at + L2 * 8)
-    exponent = msub(p, p, msub(q, q, _wide_at(item, at + EXPONENT * 8)))
-    alpha = at_most(lanes.exp2(exponent), _wide_at(camera, MAX_ALPHA))
+    exponent = msub(p, p, msub(q, q, wide_at(item, at + EXPONENT * 8)))
+    alpha = at_most(lanes.exp2(exponent), wide_at(camera, MAX_ALPHA))
     alpha = pick(exponent >= peek(camera, LOG_THRESHOLD), alpha, wide(ZERO))
     light = load(state, place)
     after = msub(alpha, light, light)
@@ -182,20 +182,20 @@ def _blend_block(state: Any, place: Any, dx: Any, dy: Any, item: Any, at: Any, c
     place += PIXELS
     store(state, place, load(state, place) + weight)
     place += PIXELS
-    store(state, place, madd(weight, _wide_at(item, at + DEPTH * 8), load(state, place)))
+    store(state, place, madd(weight, wide_at(item, at + DEPTH * 8), load(state, place)))
     if coloured:
         place += PIXELS
-        store(state, place, madd(weight, _wide_at(item, at + RED * 8), load(state, place)))
+        store(state, place, madd(weight, wide_at(item, at + RED * 8), load(state, place)))
         place += PIXELS
-        store(state, place, madd(weight, _wide_at(item, at + GREEN * 8), load(state, place)))
+        store(state, place, madd(weight, wide_at(item, at + GREEN * 8), load(state, place)))
         place += PIXELS
-        store(state, place, madd(weight, _wide_at(item, at + BLUE * 8), load(state, place)))
+        store(state, place, madd(weight, wide_at(item, at + BLUE * 8), load(state, place)))
 
 
 @inlined
-def _alive(state: Any, first: int) -> Any:
+def alive_pixels(state: Any, first: int) -> Any:
     """The pixels that let light through of the tile whose numbers start at ``first``."""
-    mask = _EMPTY
+    mask = EMPTY
     for block in range(8):
         light = load(state, first + block * 8)
         mask |= lanes.bits(light > ZERO) << np.uint64(block * 8)
@@ -217,8 +217,8 @@ def _blend_tile(
     x, y = wide(np.float32(tile % columns * TILE)), wide(np.float32(tile // columns * TILE))
     entry = np.int64(peek(scratch.head, tile))
     poke(scratch.head, tile, NONE)
-    while entry != NONE and alive != _EMPTY:
-        live = _blocks_of(alive)
+    while entry != NONE and alive != EMPTY:
+        live = blocks_of(alive)
         count = 0
         for _ in range(BATCH):
             if entry == NONE:
@@ -234,9 +234,9 @@ def _blend_tile(
         for k in range(count):
             what = np.int64(peek(work, k))
             block = (what & 7) * 8
-            dx, dy = load(_ACROSS, block) + x, load(_DOWN, block) + y
+            dx, dy = load(ACROSS, block) + x, load(DOWN, block) + y
             _blend_block(state, first + block, dx, dy, item, what >> 3, camera, coloured)
-        alive = _alive(state, first)
+        alive = alive_pixels(state, first)
     return alive
 
 
@@ -274,27 +274,27 @@ def blend(
     tiles = len(alive)
     unfinished = 0
     for tile in range(tiles):
-        unfinished += alive[tile] != _EMPTY
+        unfinished += alive[tile] != EMPTY
     reach = 3 * (degree + 1) * (degree + 1) if state.shape[1] == COLOURED else 0
     at = 0
     while at < count and unfinished > 0:
-        at, filled = _gather(order, at, count, pixel_boxes, records, alive, columns, scratch)
+        at, filled = gather(order, at, count, pixel_boxes, records, alive, columns, scratch)
         for j in range(0, filled, lanes.WIDTH):
             project_eight(scratch.source, j, camera, antialiased, scratch.item, scratch.boxes)
         for j in range(filled):
             scratch.has_colour[j] = 0
         j = 0
         while j < filled:
-            j, touched = _list(j, filled, alive, columns, harmonics, reach, scratch)
+            j, touched = list_by_tile(j, filled, alive, columns, harmonics, reach, scratch)
             for k in range(touched):
                 tile = scratch.touched[k]
                 left = _blend_tile(state, tile, columns, alive[tile], harmonics, degree, camera, scratch)
                 alive[tile] = left
-                unfinished -= left == _EMPTY
+                unfinished -= left == EMPTY
 
 
 @kernel
-def _gather(
+def gather(
     order: Any, at: int, count: int, pixel_boxes: Any, records: Any, alive: Any, columns: int, scratch: Any
 ) -> Any:
     """Copy records, from ``order[at]`` on, of Gaussians that meet an unfinished tile; returns where it stopped."""
@@ -309,13 +309,13 @@ def _gather(
         box = np.int64(peek(pixel_boxes, gaussian))
         left, right = box & 0xFFFF, box >> 16 & 0xFFFF
         top, bottom = box >> 32 & 0xFFFF, box >> 48
-        live = _EMPTY
+        live = EMPTY
         for row in range(top >> 3, (bottom >> 3) + 1):
             for column in range(left >> 3, (right >> 3) + 1):
                 live |= peek(alive, row * columns + column) & _box_mask(left, right, top, bottom, row, column)
-            if live != _EMPTY:
+            if live != EMPTY:
                 break
-        if live != _EMPTY:
+        if live != EMPTY:
             poke(who, filled, gaussian)
             lanes.prefetch(records, gaussian * RECORD)
             filled += 1
@@ -327,7 +327,7 @@ def _gather(
 
 
 @kernel
-def _list(j: int, filled: int, alive: Any, columns: int, harmonics: Any, reach: int, scratch: Any) -> Any:
+def list_by_tile(j: int, filled: int, alive: Any, columns: int, harmonics: Any, reach: int, scratch: Any) -> Any:
     """List the Gaussians of a chunk, from ``j`` on, per tile, while there is room; returns where it stopped.
 
     The first ``reach`` numbers of the harmonics of those that are listed are fetched, for their colour.
@@ -345,7 +345,7 @@ def _list(j: int, filled: int, alive: Any, columns: int, harmonics: Any, reach: 
                 for column in range(left >> 3, (right >> 3) + 1):
                     tile = row * columns + column
                     mask = peek(alive, tile) & _box_mask(left, right, top, bottom, row, column)
-                    if mask == _EMPTY:
+                    if mask == EMPTY:
                         continue
                     if peek(head, tile) == NONE:
                         poke(head, tile, entries)
@@ -356,7 +356,7 @@ def _list(j: int, filled: int, alive: Any, columns: int, harmonics: Any, reach: 
                     poke(tail, tile, entries)
                     poke(scratch.entry_item, entries, j)
                     poke(scratch.entry_next, entries, NONE)
-                    poke(scratch.entry_blocks, entries, _blocks_of(mask))
+                    poke(scratch.entry_blocks, entries, blocks_of(mask))
                     entries += 1
             if entries > before:
                 start = peek(scratch.who, j) * (harmonics.shape[1] * 3)

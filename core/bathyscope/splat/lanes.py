@@ -297,6 +297,30 @@ def bits(typing: Any, mask: Any) -> Any:
     return types.uint64(M8), emit
 
 
+# How lanes of two vectors (the second's from 8 on) are brought side by side to be added, in three rounds.
+_FOLDS = (
+    ((0, 8, 1, 9, 4, 12, 5, 13), (2, 10, 3, 11, 6, 14, 7, 15)),
+    ((0, 1, 8, 9, 4, 5, 12, 13), (2, 3, 10, 11, 6, 7, 14, 15)),
+    ((0, 1, 2, 3, 8, 9, 10, 11), (4, 5, 6, 7, 12, 13, 14, 15)),
+)
+
+
+@instruction
+def sums(typing: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
+    """The sums of eight vectors, in the order of the arguments."""
+
+    def emit(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        left = list(arguments)
+        for fold in _FOLDS:
+            left = [
+                builder.fadd(*(builder.shuffle_vector(*pair, ir.Constant(_INTS, list(order))) for order in fold))
+                for pair in zip(left[::2], left[1::2], strict=True)
+            ]
+        return left[0]
+
+    return F8(*[F8] * WIDTH), emit
+
+
 @instruction
 def below_zero(typing: Any, a: Any) -> Any:
     """-|a|."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -33,6 +33,14 @@ class Footprints:
     """With the compensation of antialiasing in them."""
     colours: Float[Tensor, "m 3"]
     """RGB towards the camera, not below 0."""
+    reaches: Float[Tensor, "m 2"]
+    """How far from the centre, along u and v, alpha can be at the threshold, px; without gradient."""
+
+    def near(self, lower: Float[Tensor, " 2"], upper: Float[Tensor, " 2"]) -> Footprints:
+        """Those that can be seen in the box from ``lower`` to ``upper`` (u, v), in the same order."""
+        meets = (self.means + self.reaches >= lower) & (self.means - self.reaches <= upper)
+        kept = torch.nonzero(meets.all(-1))[:, 0]
+        return Footprints(*(getattr(self, part.name)[kept] for part in fields(self)))
 
 
 def project(
@@ -83,6 +91,7 @@ def project(
         z[kept, 0],
         opacities[kept],
         _colours(scene.means[clip, index[kept]] - centre, scene.harmonics[clip, index[kept]], settings.degree),
+        _reaches(variances.detach()[kept], opacities.detach()[kept], settings),
     )
 
 
@@ -113,6 +122,12 @@ def _visible(
     sides = means.new_tensor((size[1], size[0]))
     meets = ((means + radii > 0) & (means - radii < sides)).all(-1)
     return meets & (radii > settings.radius_clip).any(-1) & (opacities >= settings.alpha_threshold)
+
+
+def _reaches(variances: Tensor, opacities: Tensor, settings: SplatSettings) -> Float[Tensor, "m 2"]:
+    sigmas = (2 * (opacities / settings.alpha_threshold).clamp_min(1).log()).sqrt()
+    # A thousandth more, for rounding.
+    return 1.001 * sigmas[:, None] * variances.sqrt() + 1e-3
 
 
 def _colours(away: Tensor, harmonics: Tensor, degree: int | None) -> Float[Tensor, "m 3"]:
