@@ -69,17 +69,18 @@ class DatasetFolder:
         if not frames:
             raise DatasetError(f"{path / 'frames'}: no .jpg or .png frames; a data set folder holds them there")
         calibration = read_calibration(path / "intrinsics.json")
-        mask = _read_mask(path / "mask.png", calibration.size)
+        mask = read_mask(path / "mask.png", calibration.size)
         return cls(
             path=path,
             frames=frames,
             calibration=calibration,
             truth=find_truth(path, frames, calibration, mask),
-            world_from_camera=_read_poses(path / "poses.txt", frames),
+            world_from_camera=read_poses(path / "poses.txt", frames),
         )
 
 
-def _read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
+def read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
+    """(h, w) inside the field of view: ``mask.png``, or everything where there is none."""
     if not path.is_file():
         return np.ones(size, np.bool_)
     values = read_values(path)
@@ -87,7 +88,8 @@ def _read_mask(path: Path, size: Size) -> NDArray[np.bool_]:
     return np.asarray((values if values.ndim == 2 else values[..., 0]) > 127)
 
 
-def _read_poses(path: Path, frames: tuple[Path, ...]) -> F64:
+def read_poses(path: Path, frames: tuple[Path, ...]) -> F64:
+    """``poses.txt`` as ``world_from_camera`` (t, 4, 4); NaN for frames without a pose."""
     poses = np.full((len(frames), 4, 4), np.nan)
     if not path.is_file():
         return poses

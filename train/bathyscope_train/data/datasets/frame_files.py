@@ -36,6 +36,10 @@ class ImageFiles:
         """Path of the file."""
         return str(self.paths[index])
 
+    def files(self) -> tuple[Path, ...]:
+        """All of them."""
+        return self.paths
+
 
 def number_in(path: Path) -> int:
     """The last number in a file name without its ending: 12 for ``frame_data000012.png``, 7 for ``7.jpg``.

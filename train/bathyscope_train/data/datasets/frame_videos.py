@@ -39,7 +39,7 @@ class VideoFrames:
 
     path: Path
     upper_half: bool = False
-    _decoder: Iterator[tuple[int, Image]] | None = field(default=None, init=False, repr=False)
+    _decoder: Iterator[Any] | None = field(default=None, init=False, repr=False)
     _next: int = field(default=0, init=False, repr=False)
 
     def __len__(self) -> int:
@@ -66,10 +66,11 @@ class VideoFrames:
         wanted = self._table.times[index]
         if self._decoder is None or not 0 <= index - self._next <= _LONGEST_WALK:
             self._decoder = self._decode_from(wanted)
-        for time, image in self._decoder:
-            if time >= wanted:
+        for frame in self._decoder:
+            if frame.pts >= wanted:
                 self._next = index + 1
-                if time == wanted:
+                if frame.pts == wanted:
+                    image: Image = frame.to_ndarray(format="rgb24")
                     return image[: image.shape[0] // 2] if self.upper_half else image
                 self._decoder = None
                 break
@@ -96,8 +97,8 @@ class VideoFrames:
             )
         return _Table(tuple(sorted(times)), size)
 
-    def _decode_from(self, time: int) -> Iterator[tuple[int, Image]]:
-        """Time and picture of frames from the key frame before ``time`` on; damaged ones are passed over."""
+    def _decode_from(self, time: int) -> Iterator[Any]:
+        """Frames from the key frame before ``time`` on; damaged ones are passed over."""
         import av
 
         with self.path.open("rb") as file, _opened(self.path, file) as container:
@@ -110,9 +111,11 @@ class VideoFrames:
                     decoded = packet.decode()
                 except av.FFmpegError:
                     continue
-                for frame in decoded:
-                    if frame.pts is not None and (frame.pts >= time):
-                        yield frame.pts, frame.to_ndarray(format="rgb24")
+                yield from (frame for frame in decoded if frame.pts is not None)
+
+    def files(self) -> tuple[Path, ...]:
+        """The video."""
+        return (self.path,)
 
     def __getstate__(self) -> dict[str, Any]:
         return {"path": self.path, "upper_half": self.upper_half}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Protocol
 
 import numpy as np
@@ -34,6 +35,10 @@ class FrameReader(Protocol):
 
     def where(self, index: int) -> str:
         """The file of a frame, for messages."""
+        ...
+
+    def files(self) -> tuple[Path, ...]:
+        """Every file that frames come from."""
         ...
 
 
@@ -69,6 +74,8 @@ class DataSequence:
     """(t, 4, 4), NaN for frames without a pose."""
     pose_unit: Unit | None = None
     published_crop: Crop | None = None
+    inside: NDArray[np.bool_] | None = None
+    """(h, w) the field of view, where the data set states it."""
     groups: Mapping[str, NDArray[np.bool_]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -133,6 +140,9 @@ class _SomeFrames:
 
     def where(self, index: int) -> str:
         return self.source.where(self.keep[index])
+
+    def files(self) -> tuple[Path, ...]:
+        return self.source.files()
 
 
 @dataclass(frozen=True)

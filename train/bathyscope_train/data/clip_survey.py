@@ -1,0 +1,308 @@
+"""A first pass over a video: which frames can be trained on, where scenes are cut, how far the camera moves.
+
+The pass looks at small pictures of the field of view. It drops frames that cannot be read, are of another size or
+black, and frames that show nothing new since the last one kept: motion is the median length of dense optical flow, as
+a share of the picture's width. What it finds can be kept in a folder, so a run that goes on does not look again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, PositiveFloat, PositiveInt
+
+from bathyscope.camera import Size
+from bathyscope.errors import DatasetError
+from bathyscope.vision.cuts import CutDetector, CutSettings
+from bathyscope.vision.field_of_view import DARK, FieldOfView, find_field_of_view
+from bathyscope.vision.grid import Grid, choose_size
+from bathyscope_train.data.clip_pictures import to_model_quickly
+from bathyscope_train.data.datasets.sequence import DataSequence, Image
+
+_SAMPLES = 24
+"""Frames from all over the video that the field of view is read from."""
+_LIT_SHARE = 0.01
+"""Of the pixels inside the field of view, that must not be black."""
+_NAMED = 5
+_FORMAT = 1
+
+
+class SurveySettings(BaseModel, frozen=True, extra="forbid"):
+    """What counts as usable; none of it is in the paper."""
+
+    pixels: PositiveInt = Field(default=9600, description="Area of the small pictures.")
+    still: PositiveFloat = Field(default=0.0008, description="Motion, as a share of the width, that is no motion.")
+    cuts: CutSettings = CutSettings()
+
+
+@dataclass(frozen=True, slots=True)
+class ClipSurvey:
+    """What a video holds."""
+
+    name: str
+    size: Size
+    """(height, width) of the frames that are used."""
+    view: FieldOfView
+    kept: NDArray[np.intp]
+    """(k,) numbers of the frames that are used."""
+    motion: NDArray[np.float64]
+    """(k,) how far each has moved from the one before it, as a share of the width; 0 where a shot begins."""
+    shots: NDArray[np.intp]
+    """(s + 1,) where in ``kept`` each shot begins, and its end."""
+    notes: tuple[str, ...]
+    """What was left out, in words."""
+
+
+def survey_clip(
+    sequence: DataSequence, settings: SurveySettings | None = None, cache: Path | None = None
+) -> ClipSurvey:
+    """Look at every frame of a video once.
+
+    Args:
+        sequence: The video.
+        settings: What counts as usable.
+        cache: Folder in which the result is kept, under a name that changes with the files and the settings.
+
+    Raises:
+        DatasetError: If not one frame can be read, or all are black.
+    """
+    settings = settings or SurveySettings()
+    if cache is None:
+        return _survey(sequence, settings)
+    path = cache / f"survey_{_fingerprint(sequence, settings)}.npz"
+    known = _read(path) if path.is_file() else None
+    if known is None:
+        known = _survey(sequence, settings)
+        _write(path, known)
+    return known
+
+
+def survey_clips(
+    sequences: Sequence[DataSequence],
+    settings: SurveySettings | None = None,
+    cache: Path | None = None,
+    workers: int = 2,
+) -> tuple[list[tuple[DataSequence, ClipSurvey]], list[str]]:
+    """Survey several videos; those that cannot be used are left out, with the reason in the second list."""
+
+    def look(sequence: DataSequence) -> ClipSurvey | str:
+        try:
+            return survey_clip(sequence, settings, cache)
+        except DatasetError as error:
+            return str(error)
+
+    with ThreadPoolExecutor(max(workers, 1)) as pool:
+        found = list(pool.map(look, sequences))
+    good = [
+        (sequence, result) for sequence, result in zip(sequences, found, strict=True) if isinstance(result, ClipSurvey)
+    ]
+    return good, [result for result in found if isinstance(result, str)]
+
+
+def _survey(sequence: DataSequence, settings: SurveySettings) -> ClipSurvey:
+    size = _usual_size(sequence)
+    view = _view(sequence, size)
+    top, left, bottom, right = view.box
+    grid = Grid.of(view, choose_size((bottom - top, right - left), 4, settings.pixels))
+    walk = _Walk(grid, settings)
+    for index, image in _readable(sequence, walk):
+        if image.shape[:2] != size:
+            walk.other_size.append(f"{sequence.frames.where(index)} ({image.shape[1]}x{image.shape[0]})")
+        else:
+            walk.see(index, image)
+    if not walk.kept:
+        raise DatasetError(f"{sequence.name}: no frame can be used: {'; '.join(walk.said()) or 'it holds none'}")
+    return ClipSurvey(
+        name=sequence.name,
+        size=size,
+        view=view,
+        kept=np.array(walk.kept, np.intp),
+        motion=np.array(walk.motion),
+        shots=np.array([*walk.starts, len(walk.kept)], np.intp),
+        notes=tuple(walk.said()),
+    )
+
+
+class _Walk:
+    """Goes through a video and keeps what is of use."""
+
+    def __init__(self, grid: Grid, settings: SurveySettings) -> None:
+        self.kept: list[int] = []
+        self.motion: list[float] = []
+        self.starts: list[int] = []
+        self.unreadable: list[str] = []
+        self.other_size: list[str] = []
+        self._black: list[int] = []
+        self._still = 0
+        self._grid, self._settings = grid, settings
+        self._cuts = CutDetector(settings.cuts, grid.inside)
+        self._flow = MotionMeter(grid)
+
+    def see(self, index: int, image: Image) -> None:
+        """Judge the next frame."""
+        small = to_model_quickly(self._grid, image)
+        if float((small.max(0)[self._grid.inside] * 255 > DARK).mean()) < _LIT_SHARE:
+            self._black.append(index)
+            return
+        begins = self._cuts.is_cut(small) or not self.kept
+        moved = 0.0 if begins else self._flow.since(small)
+        if not begins and moved < self._settings.still:
+            self._still += 1
+            return
+        self._flow.keep(small)
+        if begins:
+            self.starts.append(len(self.kept))
+        self.kept.append(index)
+        self.motion.append(moved)
+
+    def said(self) -> list[str]:
+        """What was left out, in words."""
+        found = []
+        if self.unreadable:
+            found.append(f"{len(self.unreadable)} frames cannot be read: {_some(self.unreadable)}")
+        if self.other_size:
+            found.append(f"{len(self.other_size)} frames of another size are left out: {_some(self.other_size)}")
+        if self._black:
+            found.append(f"{len(self._black)} black frames are left out, first number {self._black[0]}")
+        if self._still:
+            found.append(f"{self._still} frames show nothing new and are left out")
+        return found
+
+
+class MotionMeter:
+    """Median length of dense optical flow inside the field of view, as a share of the picture's width."""
+
+    def __init__(self, grid: Grid) -> None:
+        import cv2
+
+        self._inside = grid.inside
+        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
+        self._before: NDArray[np.uint8] | None = None
+
+    def keep(self, small: NDArray[np.float32]) -> None:
+        """Measure from this picture (3, h, w) from now on."""
+        self._before = _grey(small)
+
+    def since(self, small: NDArray[np.float32]) -> float:
+        """Motion from the picture that was kept last to this one."""
+        assert self._before is not None
+        now = _grey(small)
+        flow: Any = self._flow.calc(self._before, now, np.zeros((*now.shape, 2), np.float32))
+        return float(np.median(np.hypot(flow[..., 0], flow[..., 1])[self._inside]) / small.shape[2])
+
+
+def _grey(small: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.ascontiguousarray(np.rint(small.mean(0) * 255).clip(0, 255).astype(np.uint8))
+
+
+def _readable(sequence: DataSequence, walk: _Walk) -> Iterator[tuple[int, Image]]:
+    for index in range(len(sequence)):
+        try:
+            image = sequence.frames.read(index)
+        except DatasetError as error:
+            walk.unreadable.append(str(error))
+            continue
+        yield index, image
+
+
+def _samples(sequence: DataSequence) -> Iterator[Image]:
+    for index in sorted(set(np.linspace(0, len(sequence) - 1, _SAMPLES).astype(int).tolist())):
+        try:
+            yield sequence.frames.read(index)
+        except DatasetError:
+            continue  # named in the pass over all frames
+
+
+def _usual_size(sequence: DataSequence) -> Size:
+    """The size that most of the sampled frames have."""
+    sizes = Counter((image.shape[0], image.shape[1]) for image in _samples(sequence))
+    if not sizes:
+        return _first_reason(sequence)
+    return sizes.most_common(1)[0][0]
+
+
+def _first_reason(sequence: DataSequence) -> Size:
+    """Raise why frames cannot be read, or find one that can."""
+    problem: DatasetError | None = None
+    for index in range(len(sequence)):
+        try:
+            image = sequence.frames.read(index)
+        except DatasetError as error:
+            problem = problem or error
+        else:
+            return image.shape[0], image.shape[1]
+    raise DatasetError(f"{sequence.name}: none of its {len(sequence)} frames can be read; first: {problem}")
+
+
+def _view(sequence: DataSequence, size: Size) -> FieldOfView:
+    if sequence.inside is not None and sequence.inside.shape == size and sequence.inside.any():
+        return FieldOfView(sequence.inside, "hull")
+    brightest: NDArray[np.uint8] | None = None
+    for image in _samples(sequence):
+        if image.shape[:2] == size:
+            level = image.max(-1)
+            brightest = level if brightest is None else np.maximum(brightest, level)
+    assert brightest is not None
+    return find_field_of_view(brightest)
+
+
+def _some(names: list[str]) -> str:
+    return "; ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
+
+
+def _fingerprint(sequence: DataSequence, settings: SurveySettings) -> str:
+    digest = hashlib.sha256(f"{_FORMAT} {sequence.name} {sequence.size} {settings.model_dump_json()}".encode())
+    for name in sequence.frame_names:
+        digest.update(name.encode())
+    for path in sequence.frames.files():
+        state = path.stat() if path.is_file() else None
+        digest.update(f"{path.name} {state and (state.st_size, state.st_mtime_ns)}\n".encode())
+    if sequence.inside is not None:
+        digest.update(np.packbits(sequence.inside).tobytes())
+    return digest.hexdigest()[:24]
+
+
+def _write(path: Path, survey: ClipSurvey) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}")
+    about = {"name": survey.name, "size": survey.size, "shape": survey.view.shape, "notes": survey.notes}
+    with beside.open("wb") as file:
+        np.savez(
+            file,
+            about=np.array(json.dumps(about)),
+            inside=np.packbits(survey.view.mask),
+            kept=survey.kept,
+            motion=survey.motion,
+            shots=survey.shots,
+        )
+    beside.replace(path)
+
+
+def _read(path: Path) -> ClipSurvey | None:
+    """What an earlier run found; ``None`` where the file is damaged, so that it is made again."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            about: dict[str, Any] = json.loads(str(file["about"]))
+            height, width = about["size"]
+            inside = np.unpackbits(file["inside"], count=height * width).astype(np.bool_).reshape(height, width)
+            return ClipSurvey(
+                name=about["name"],
+                size=(height, width),
+                view=FieldOfView(inside, about["shape"]),
+                kept=file["kept"],
+                motion=file["motion"],
+                shots=file["shots"],
+                notes=tuple(about["notes"]),
+            )
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
