@@ -15,7 +15,7 @@ from bathyscope.errors import BathyscopeError
 from bathyscope.result import ResultMeta
 from bathyscope.result_files import Precision
 from bathyscope_client.clips import LocalClip, images_in
-from bathyscope_client.outputs import output_paths, write_outputs
+from bathyscope_client.outputs import made_of, output_paths, write_outputs
 from bathyscope_client.runners import OnProgress, Runner
 
 MARKER_SUFFIX = "_done.json"
@@ -116,7 +116,8 @@ class _Batch:
         paths = output_paths(self.out, clip.name)
         marker = self.out / f"{clip.name}{MARKER_SUFFIX}"
         found = _read_marker(marker)
-        if found and found.same_as(wanted) and all(path.is_file() for path in paths.values()) and not self.again:
+        same = found is not None and found.same_as(wanted)
+        if found and same and all(paths[kind].is_file() for kind in made_of(found.meta)) and not self.again:
             return _report(clip, "skipped", paths, found.meta)
         marker.unlink(missing_ok=True)
         meta = self._make(clip, paths, progress)
@@ -135,8 +136,12 @@ class _Batch:
             meta = write_outputs(
                 clip.path, drafts, self.settings.most_points, lambda done, total: progress("writing", done, total)
             )
-            for kind, draft in drafts.items():
-                draft.replace(paths[kind])
+            made = made_of(meta)
+            for kind, path in paths.items():
+                if kind in made:
+                    drafts[kind].replace(path)
+                else:
+                    path.unlink(missing_ok=True)  # of a model that had cameras
         finally:
             shutil.rmtree(beside, ignore_errors=True)
         return meta
@@ -165,5 +170,5 @@ def _write_marker(path: Path, done: Done) -> None:
 def _report(
     clip: LocalClip, status: Literal["done", "skipped"], paths: dict[str, Path], meta: ResultMeta
 ) -> ClipReport:
-    outputs = {kind: str(path) for kind, path in paths.items()}
+    outputs = {kind: str(paths[kind]) for kind in made_of(meta)}
     return ClipReport(name=clip.name, source=str(clip.path), status=status, outputs=outputs, meta=meta)

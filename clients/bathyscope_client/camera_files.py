@@ -14,7 +14,7 @@ from bathyscope.tum import tum_lines
 
 
 def write_camera_files(reader: NpzReader, poses: Path, intrinsics: Path) -> None:
-    """Write both files in one pass over a result."""
+    """Write both files in one pass over a result that has cameras."""
     entries: list[dict[str, Any]] = []
     segment: int | None = None
     with poses.open("w") as file:
@@ -23,6 +23,7 @@ def write_camera_files(reader: NpzReader, poses: Path, intrinsics: Path) -> None
             if frame.segment != segment:
                 segment = frame.segment
                 file.write(f"# segment {segment}: a world and a scale of its own\n")
+            assert frame.world_from_camera is not None
             file.writelines(tum_lines(np.array([frame.timestamp_s]), frame.world_from_camera[None]))
             entries.append(_entry(frame))
     intrinsics.write_text(json.dumps(_described(reader.size, reader.meta, entries), indent=1) + "\n")
@@ -30,6 +31,7 @@ def write_camera_files(reader: NpzReader, poses: Path, intrinsics: Path) -> None
 
 def _entry(frame: FrameDepth) -> dict[str, Any]:
     k = frame.intrinsics
+    assert k is not None
     return {
         "timestamp_s": frame.timestamp_s,
         "fx": float(k[0, 0]),

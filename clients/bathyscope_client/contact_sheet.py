@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from bathyscope.camera import Size
 from bathyscope.errors import ResultError
 from bathyscope.result import FrameDepth
-from bathyscope_client.depth_colours import ClipRange, colour_depth
+from bathyscope_client.depth_colours import ClipRange, colour_depth, inverse
 from bathyscope_client.preview import pane_size
 
 _TILES = 8
@@ -63,11 +63,12 @@ class SheetWriter:
         return tile
 
     def _legend(self, width: int) -> NDArray[np.uint8]:
-        unit = "mm" if self._scale == "mm" else "(relative)"
+        unit = "mm" if self._scale == "mm" else f"({self._scale})"
         near, far = f"near {self._span.near:.3g} {unit}", f"{self._span.far:.3g} {unit} far"
         legend = np.zeros((2 * _CAPTION, width, 3), np.uint8)
         ramp = np.geomspace(max(self._span.near, 1e-12), max(self._span.far, 1e-12), width).astype(np.float32)
-        bar = colour_depth(ramp[None], np.ones((1, width), np.bool_), self._span)
+        values = inverse(ramp) if self._span.disparity else ramp
+        bar = colour_depth(values[None], np.ones((1, width), np.bool_), self._span)
         legend[:_CAPTION] = bar
         _write(legend, near, (2, 2 * _CAPTION - 7))
         _write(legend, far, (max(2, width - 9 * len(far)), 2 * _CAPTION - 7))

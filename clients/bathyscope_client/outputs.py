@@ -30,6 +30,8 @@ SUFFIXES = {
     "sheet": "_sheet.png",
 }
 """What each file's name is the clip's name and."""
+_OF_CAMERAS = ("poses", "intrinsics", "cloud")
+"""Files that a network without cameras cannot give."""
 OnFrames = Callable[[int, int], None]
 
 
@@ -54,8 +56,13 @@ def output_paths(folder: Path, name: str) -> dict[str, Path]:
     return {kind: folder / f"{name}{suffix}" for kind, suffix in SUFFIXES.items()}
 
 
+def made_of(meta: ResultMeta) -> tuple[str, ...]:
+    """Which of the files a result with this meta data gives."""
+    return tuple(kind for kind in SUFFIXES if kind not in _OF_CAMERAS or "cameras" in meta.outputs)
+
+
 def write_outputs(source: Path, paths: dict[str, Path], most_points: int, on_frames: OnFrames) -> ResultMeta:
-    """Make every other file of a clip from ``paths["depth"]``.
+    """Make every other file of a clip from ``paths["depth"]``, as far as :func:`made_of` its meta data goes.
 
     Raises:
         ResultError: If the result is damaged.
@@ -63,14 +70,18 @@ def write_outputs(source: Path, paths: dict[str, Path], most_points: int, on_fra
     """
     write_zip(paths["depth"], paths["pictures"])
     with NpzReader(paths["depth"]) as reader:
-        write_camera_files(reader, paths["poses"], paths["intrinsics"])
-        span = measure_range(reader)
+        made = made_of(reader.meta)
+        if "poses" in made:
+            write_camera_files(reader, paths["poses"], paths["intrinsics"])
+        span = measure_range(reader, disparity="disparity" in reader.meta.outputs)
         scale = reader.meta.scale
-        with _finished(
+        writers_of: list[FrameWriter] = [
             PreviewWriter(paths["preview"], span, reader.size),
-            CloudWriter(paths["cloud"], span, most_points, scale),
             SheetWriter(paths["sheet"], span, reader.size, scale),
-        ) as writers:
+        ]
+        if "cloud" in made:
+            writers_of.append(CloudWriter(paths["cloud"], span, most_points, scale))
+        with _finished(*writers_of) as writers:
             for number, (frame, image) in enumerate(pair_with_source(reader, source), 1):
                 for writer in writers:
                     writer.add(frame, image)

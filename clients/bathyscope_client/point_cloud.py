@@ -50,10 +50,13 @@ class CloudWriter:
         self._body = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115 - closed by close() or abandon()
 
     def add(self, frame: FrameDepth, image: NDArray[np.uint8]) -> None:
-        """Add some points of one frame."""
+        """Add some points of one frame, which has a camera."""
         if frame.segment != self._span.longest_segment:
             return
-        candidates = np.flatnonzero(frame.valid & (frame.confidence >= self._span.sure) & ~steep(frame.depth))
+        assert frame.intrinsics is not None
+        assert frame.world_from_camera is not None
+        sure = True if frame.confidence is None else frame.confidence >= self._span.sure
+        candidates = np.flatnonzero(frame.valid & sure & ~steep(frame.depth))
         wanted = min(self._share, len(candidates), self._most - self._count)
         picked = self._random.choice(candidates, wanted, replace=False) if wanted else candidates[:0]
         rows, columns = np.unravel_index(picked, frame.depth.shape)

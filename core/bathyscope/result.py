@@ -15,8 +15,9 @@ from pydantic import BaseModel, Field
 
 from bathyscope.camera import F64, Size
 from bathyscope.errors import GeometryError
+from bathyscope.model_spec import Output
 
-RESULT_FORMAT = 1
+RESULT_FORMAT = 2
 """Version of the result files; a reader refuses newer ones."""
 DepthKind = Literal["rendered", "accumulated", "head"]
 """Where depth comes from."""
@@ -35,8 +36,15 @@ class ResultMeta(BaseModel, frozen=True, extra="forbid"):
 
     format: int = RESULT_FORMAT
     name: str = "clip"
-    scale: Literal["relative", "mm"] = Field(
-        default="relative", description="'relative': right up to one positive factor for each segment of the video."
+    outputs: tuple[Output, ...] = Field(
+        default=("depth", "confidence", "cameras"),
+        description="What the result holds. With 'disparity' in the place of 'depth', the array ``depth`` holds "
+        "disparity: near is large, 0 is infinitely far.",
+    )
+    scale: Literal["relative", "mm", "affine"] = Field(
+        default="relative",
+        description="'relative': right up to one positive factor for each segment of the video; 'affine': up to a "
+        "factor and a shift.",
     )
     depth: DepthKind = Field(
         default="rendered",
@@ -59,15 +67,15 @@ class FrameDepth:
     """Number of the frame in the source, from 0."""
     timestamp_s: float
     depth: NDArray[np.floating]
-    """(h, w) z-depth; 0 where nothing is known."""
-    confidence: NDArray[np.floating]
-    """(h, w), larger is surer; 0 outside the field of view."""
+    """(h, w) z-depth, 0 where nothing is known; or disparity, where ``ResultMeta.outputs`` says so."""
+    confidence: NDArray[np.floating] | None
+    """(h, w), larger is surer; 0 outside the field of view. ``None`` from a network that has none."""
     valid: NDArray[np.bool_]
     """(h, w) inside the field of view, with depth."""
-    world_from_camera: F64
-    """(4, 4) in the world of the segment's first frame."""
-    intrinsics: F64
-    """(3, 3) pixels at source size."""
+    world_from_camera: F64 | None
+    """(4, 4) in the world of the segment's first frame; ``None`` from a network without cameras."""
+    intrinsics: F64 | None
+    """(3, 3) pixels at source size; ``None`` from a network without cameras."""
     segment: int = 0
     """Frames of one segment share one world and one scale."""
 
@@ -77,19 +85,19 @@ class ClipDepth:
     """Depth and cameras of a whole clip; t frames of (h, w) at source size.
 
     Raises:
-        GeometryError: If the arrays do not belong together.
+        GeometryError: If the arrays do not belong together, or are not those that ``meta.outputs`` names.
     """
 
     depth: NDArray[np.floating]
-    """(t, h, w) z-depth, float32 or float16; 0 where nothing is known."""
-    confidence: NDArray[np.floating]
-    """(t, h, w)"""
+    """(t, h, w) z-depth, float32 or float16; 0 where nothing is known. Or disparity, where ``meta.outputs`` says so."""
+    confidence: NDArray[np.floating] | None
+    """(t, h, w); ``None`` from a network that has none."""
     valid: NDArray[np.bool_]
     """(t, h, w)"""
-    world_from_camera: F64
-    """(t, 4, 4); the first frame of each segment is the identity."""
-    intrinsics: F64
-    """(t, 3, 3) pixels at source size."""
+    world_from_camera: F64 | None
+    """(t, 4, 4); the first frame of each segment is the identity. ``None`` from a network without cameras."""
+    intrinsics: F64 | None
+    """(t, 3, 3) pixels at source size; ``None`` from a network without cameras."""
     timestamps_s: F64
     """(t,) seconds from the start of the source."""
     segment: NDArray[np.int32]
@@ -108,10 +116,15 @@ class ClipDepth:
             "timestamps_s": (t,),
             "segment": (t,),
         }
+        held = array_names(self.meta.outputs)
         for name, shape in wanted.items():
-            found = getattr(self, name).shape
-            if found != shape:
-                raise GeometryError(f"{name} beside depth {self.depth.shape} must have shape {shape}, got {found}")
+            array = getattr(self, name)
+            if (array is not None) != (name in held):
+                raise GeometryError(f"meta says outputs {self.meta.outputs}; {name} is {_described(array)}")
+            if array is not None and array.shape != shape:
+                raise GeometryError(
+                    f"{name} beside depth {self.depth.shape} must have shape {shape}, got {array.shape}"
+                )
 
     def __len__(self) -> int:
         return len(self.depth)
@@ -127,10 +140,10 @@ class ClipDepth:
             index=t,
             timestamp_s=float(self.timestamps_s[t]),
             depth=self.depth[t],
-            confidence=self.confidence[t],
+            confidence=None if self.confidence is None else self.confidence[t],
             valid=self.valid[t],
-            world_from_camera=self.world_from_camera[t],
-            intrinsics=self.intrinsics[t],
+            world_from_camera=None if self.world_from_camera is None else self.world_from_camera[t],
+            intrinsics=None if self.intrinsics is None else self.intrinsics[t],
             segment=int(self.segment[t]),
         )
 
@@ -139,7 +152,7 @@ class ClipDepth:
         """The clip that finished frames make.
 
         Raises:
-            GeometryError: If there is no frame, or their sizes differ.
+            GeometryError: If there is no frame, their sizes differ, or only some of them have a camera.
         """
         if not frames:
             raise GeometryError("a result needs at least one frame, got none")
@@ -148,10 +161,10 @@ class ClipDepth:
             raise GeometryError(f"the frames of a result must have one size, got {sorted(sizes)}")
         return cls(
             depth=np.stack([frame.depth for frame in frames]),
-            confidence=np.stack([frame.confidence for frame in frames]),
+            confidence=_stacked([frame.confidence for frame in frames]),
             valid=np.stack([frame.valid for frame in frames]),
-            world_from_camera=np.stack([frame.world_from_camera for frame in frames]),
-            intrinsics=np.stack([frame.intrinsics for frame in frames]),
+            world_from_camera=_stacked([frame.world_from_camera for frame in frames]),
+            intrinsics=_stacked([frame.intrinsics for frame in frames]),
             timestamps_s=np.array([frame.timestamp_s for frame in frames], np.float64),
             segment=np.array([frame.segment for frame in frames], np.int32),
             meta=meta,
@@ -159,4 +172,24 @@ class ClipDepth:
 
 
 ARRAY_NAMES = tuple(field.name for field in fields(ClipDepth) if field.name != "meta")
-"""Names of the arrays of a result, in the order of its files."""
+"""Names of the arrays that a result may have, in the order of its files."""
+_OPTIONAL: dict[str, Output] = {"confidence": "confidence", "world_from_camera": "cameras", "intrinsics": "cameras"}
+
+
+def array_names(outputs: tuple[Output, ...]) -> tuple[str, ...]:
+    """Names of the arrays of a result with these outputs, in the order of its files."""
+    return tuple(name for name in ARRAY_NAMES if name not in _OPTIONAL or _OPTIONAL[name] in outputs)
+
+
+def _stacked(arrays: list[Any]) -> Any:
+    """One array of those of all frames; ``None`` if no frame has one."""
+    missing = sum(array is None for array in arrays)
+    if missing == len(arrays):
+        return None
+    if missing:
+        raise GeometryError(f"{missing} of {len(arrays)} frames lack what the others have")
+    return np.stack(arrays)
+
+
+def _described(array: NDArray[Any] | None) -> str:
+    return "missing" if array is None else f"there, of shape {array.shape}"

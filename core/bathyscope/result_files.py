@@ -24,7 +24,7 @@ from pydantic import ValidationError
 
 from bathyscope.camera import Size
 from bathyscope.errors import GeometryError, ResultError
-from bathyscope.result import ARRAY_NAMES, RESULT_FORMAT, ClipDepth, FrameDepth, ResultMeta
+from bathyscope.result import ARRAY_NAMES, RESULT_FORMAT, ClipDepth, FrameDepth, ResultMeta, array_names
 from bathyscope.zip_errors import ZIP_ERRORS
 
 MAPS = ("depth", "confidence", "valid")
@@ -40,6 +40,8 @@ _COLUMN_SHAPES: dict[str, tuple[int, ...]] = {
     "timestamps_s": (),
     "segment": (),
 }
+_FIELDS = {"timestamps_s": "timestamp_s"}
+"""What an array of a clip is called in a frame, where that differs."""
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 
 
@@ -59,6 +61,7 @@ class NpzWriter:
         # go, would cut the heap into holes that nothing fits (measured: 0.1 MB a frame)
         self._columns = {name: array("d") for name in _COLUMN_SHAPES}
         self._size: Size | None = None
+        self._held: tuple[str, ...] = ()
 
     def __enter__(self) -> Self:
         return self
@@ -73,35 +76,40 @@ class NpzWriter:
         """Add the next frame.
 
         Raises:
-            GeometryError: If it is not of the size of the frames before, or its depth is not finite.
+            GeometryError: If it is not of the size of the frames before, has not what they have, or its depth is not
+                finite.
         """
         size = (frame.depth.shape[0], frame.depth.shape[1])
+        held = tuple(name for name in ARRAY_NAMES if getattr(frame, _FIELDS.get(name, name)) is not None)
         if self._size not in (None, size):
             raise GeometryError(f"frame {frame.index} is {size}, the frames before are {self._size}")
+        if self._held not in ((), held):
+            raise GeometryError(f"frame {frame.index} has {held}, the frames before have {self._held}")
         if not np.isfinite(frame.depth).all():
             raise GeometryError(f"frame {frame.index} has depth that is not finite")
-        self._size = size
-        for name in MAPS:
-            values = np.ascontiguousarray(getattr(frame, name), self._types[name])
-            self._spools[name].write(values.data)
-        self._columns["world_from_camera"].extend(np.ravel(frame.world_from_camera).tolist())
-        self._columns["intrinsics"].extend(np.ravel(frame.intrinsics).tolist())
-        self._columns["timestamps_s"].append(frame.timestamp_s)
-        self._columns["segment"].append(frame.segment)
+        self._size, self._held = size, held
+        for name in held:
+            values = getattr(frame, _FIELDS.get(name, name))
+            if name in MAPS:
+                self._spools[name].write(np.ascontiguousarray(values, self._types[name]).data)
+            else:
+                self._columns[name].extend(np.ravel(values).tolist())
 
     def close(self, meta: ResultMeta) -> Path:
         """Write the file and return its path.
 
         Raises:
-            ResultError: If no frame was added.
+            ResultError: If no frame was added, or ``meta.outputs`` are not what the frames had.
         """
         if self._size is None:
             raise ResultError(f"{self.path.name}: a result needs at least one frame, got none")
+        if self._held != array_names(meta.outputs):
+            raise ResultError(f"{self.path.name}: its frames have {self._held}, its meta data says {meta.outputs}")
         for spool in self._spools.values():
             spool.close()
         whole = self._folder / "whole.npz"
         with zipfile.ZipFile(whole, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-            for name in ARRAY_NAMES:
+            for name in self._held:
                 self._write_array(archive, name)
             _write_npy(archive, "meta", np.array(meta.model_dump_json()))
         with whole.open("rb") as file:
@@ -147,9 +155,10 @@ class NpzReader:
         except ZIP_ERRORS as error:
             raise ResultError(f"{self.path}: not a readable npz file ({error})") from error
         try:
-            self._headers = {name: self._header(name) for name in MAPS}
-            self._columns = {name: self._small(name) for name in ARRAY_NAMES if name not in MAPS}
             self.meta = _parse_meta(str(self._small("meta")), self.path.name)
+            held = array_names(self.meta.outputs)
+            self._headers = {name: self._header(name) for name in MAPS if name in held}
+            self._columns = {name: self._small(name) for name in held if name not in MAPS}
             self._check()
         except BaseException:
             self._archive.close()
@@ -172,12 +181,12 @@ class NpzReader:
 
     def __iter__(self) -> Iterator[FrameDepth]:
         """The frames in order; only one is in memory at a time."""
-        spools = {name: self._open(name) for name in MAPS}
+        spools = {name: self._open(name) for name in self._headers}
         try:
             for name, spool in spools.items():
                 _read_header(spool, self.path.name, name)
             for t in range(len(self)):
-                yield self._frame(t, {name: self._next_map(name, spools[name]) for name in MAPS})
+                yield self._frame(t, {name: self._next_map(name, spools[name]) for name in self._headers})
         finally:
             for spool in spools.values():
                 spool.close()
@@ -191,12 +200,15 @@ class NpzReader:
             index=t,
             timestamp_s=float(self._columns["timestamps_s"][t]),
             depth=maps["depth"],
-            confidence=maps["confidence"],
+            confidence=maps.get("confidence"),
             valid=maps["valid"],
-            world_from_camera=self._columns["world_from_camera"][t],
-            intrinsics=self._columns["intrinsics"][t],
+            world_from_camera=self._matrix("world_from_camera", t),
+            intrinsics=self._matrix("intrinsics", t),
             segment=int(self._columns["segment"][t]),
         )
+
+    def _matrix(self, name: str, t: int) -> Any:
+        return self._columns[name][t] if name in self._columns else None
 
     def _next_map(self, name: str, spool: IO[bytes]) -> Any:
         (_, h, w), dtype = self._headers[name]
@@ -242,9 +254,9 @@ class NpzReader:
 
     def _check(self) -> None:
         t, h, w = self._headers["depth"][0]
-        wanted = {"world_from_camera": (t, 4, 4), "intrinsics": (t, 3, 3), "timestamps_s": (t,), "segment": (t,)}
+        wanted = {name: (t, *_COLUMN_SHAPES[name]) for name in self._columns}
         found = {name: self._columns[name].shape for name in wanted}
-        if found != wanted or any(self._headers[name][0] != (t, h, w) for name in MAPS):
+        if found != wanted or any(shape != (t, h, w) for shape, _ in self._headers.values()):
             raise ResultError(f"{self.path.name}: the arrays do not belong together: depth {(t, h, w)}, others {found}")
 
 

@@ -2,9 +2,9 @@
 
 ``depth/000000.png`` (uint16; depth = value * ``depth_scale`` of ``result.json``, 0 = nothing there), ``confidence/``
 likewise, ``valid/`` (8 bits, 255 = valid), ``poses.txt`` (TUM, camera to world) and ``result.json`` with cameras,
-time stamps and meta data. Depth is rounded to one step of ``depth_scale``, a power of two and at most 1/32,768 of the
-clip's largest value; everything else is kept exactly. Because the step is a power of two, reading a zip and writing it
-again changes nothing.
+time stamps and meta data; without ``confidence/`` or ``poses.txt`` where the network has no such thing. Depth is
+rounded to one step of ``depth_scale``, a power of two and at most 1/32,768 of the clip's largest value; everything else
+is kept exactly. Because the step is a power of two, reading a zip and writing it again changes nothing.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
+from bathyscope.camera import F64
 from bathyscope.errors import ResultError
 from bathyscope.png import decode_grey, encode_grey
 from bathyscope.result import ClipDepth, FrameDepth, ResultMeta
-from bathyscope.result_files import NpzReader
+from bathyscope.result_files import MAPS, NpzReader
 from bathyscope.tum import tum_lines
 from bathyscope.zip_errors import ZIP_ERRORS
 
@@ -39,15 +40,15 @@ class ZipFrame(BaseModel, frozen=True, extra="forbid"):
 
     timestamp_s: float
     segment: int
-    world_from_camera: list[list[float]]
-    intrinsics: list[list[float]]
+    world_from_camera: list[list[float]] | None
+    intrinsics: list[list[float]] | None
 
 
 class ZipIndex(BaseModel, frozen=True, extra="forbid"):
     """``result.json``."""
 
     depth_scale: float
-    confidence_scale: float
+    confidence_scale: float | None
     size: tuple[int, int]
     meta: ResultMeta
     frames: list[ZipFrame]
@@ -91,12 +92,15 @@ def _write(frames: Callable[[], Iterable[FrameDepth]], meta: ResultMeta, size: t
         with zipfile.ZipFile(beside, "w", zipfile.ZIP_STORED) as archive:
             for t, frame in enumerate(frames()):
                 _add(archive, f"depth/{t:06d}.png", encode_grey(_quantise(frame.depth, depth_scale)))
-                _add(archive, f"confidence/{t:06d}.png", encode_grey(_quantise(frame.confidence, confidence_scale)))
+                if frame.confidence is not None:
+                    levels = _quantise(frame.confidence, confidence_scale or 1.0)
+                    _add(archive, f"confidence/{t:06d}.png", encode_grey(levels))
                 _add(archive, f"valid/{t:06d}.png", encode_grey(np.where(frame.valid, 255, 0).astype(np.uint8)))
                 entries.append(_entry(frame))
-            poses = np.array([entry.world_from_camera for entry in entries], np.float64)
-            stamps = np.array([entry.timestamp_s for entry in entries], np.float64)
-            _add(archive, "poses.txt", "".join(tum_lines(stamps, poses)).encode())
+            if "cameras" in meta.outputs:
+                poses = np.array([entry.world_from_camera for entry in entries], np.float64)
+                stamps = np.array([entry.timestamp_s for entry in entries], np.float64)
+                _add(archive, "poses.txt", "".join(tum_lines(stamps, poses)).encode())
             index = ZipIndex(
                 depth_scale=depth_scale, confidence_scale=confidence_scale, size=size, meta=meta, frames=entries
             )
@@ -109,13 +113,15 @@ def _write(frames: Callable[[], Iterable[FrameDepth]], meta: ResultMeta, size: t
     return path
 
 
-def _scales(frames: Iterable[FrameDepth]) -> tuple[float, float]:
+def _scales(frames: Iterable[FrameDepth]) -> tuple[float, float | None]:
     """Steps of depth and confidence that hold the largest value of the clip."""
-    depth = confidence = 0.0
+    depth = 0.0
+    confidences: list[float] = []
     for frame in frames:
         depth = max(depth, float(frame.depth.max()))
-        confidence = max(confidence, float(frame.confidence.max()))
-    return _power_of_two_step(depth), _power_of_two_step(confidence)
+        if frame.confidence is not None:
+            confidences.append(float(frame.confidence.max()))
+    return _power_of_two_step(depth), _power_of_two_step(max(confidences)) if confidences else None
 
 
 def _power_of_two_step(largest: float) -> float:
@@ -133,15 +139,17 @@ def _entry(frame: FrameDepth) -> ZipFrame:
     return ZipFrame(
         timestamp_s=frame.timestamp_s,
         segment=frame.segment,
-        world_from_camera=frame.world_from_camera.tolist(),
-        intrinsics=frame.intrinsics.tolist(),
+        world_from_camera=None if frame.world_from_camera is None else frame.world_from_camera.tolist(),
+        intrinsics=None if frame.intrinsics is None else frame.intrinsics.tolist(),
     )
 
 
 def _read_frame(archive: zipfile.ZipFile, index: ZipIndex, t: int) -> FrameDepth:
     entry = index.frames[t]
     maps: dict[str, Any] = {}
-    for name in ("depth", "confidence", "valid"):
+    for name in MAPS:
+        if name == "confidence" and index.confidence_scale is None:
+            continue
         image = decode_grey(_read(archive, f"{name}/{t:06d}.png", MAX_PNG_BYTES))
         if image.shape != index.size:
             raise ResultError(f"{name}/{t:06d}.png is {image.shape}, result.json says {index.size}")
@@ -150,12 +158,20 @@ def _read_frame(archive: zipfile.ZipFile, index: ZipIndex, t: int) -> FrameDepth
         index=t,
         timestamp_s=entry.timestamp_s,
         depth=(maps["depth"] * index.depth_scale).astype(np.float32),
-        confidence=(maps["confidence"] * index.confidence_scale).astype(np.float32),
+        confidence=_confidence(maps.get("confidence"), index.confidence_scale),
         valid=maps["valid"] > 127,
-        world_from_camera=np.array(entry.world_from_camera, np.float64),
-        intrinsics=np.array(entry.intrinsics, np.float64),
+        world_from_camera=_matrix(entry.world_from_camera),
+        intrinsics=_matrix(entry.intrinsics),
         segment=entry.segment,
     )
+
+
+def _confidence(levels: Any, scale: float | None) -> Any:
+    return None if scale is None else (levels * scale).astype(np.float32)
+
+
+def _matrix(rows: list[list[float]] | None) -> F64 | None:
+    return None if rows is None else np.array(rows, np.float64)
 
 
 def _read(archive: zipfile.ZipFile, name: str, limit: int) -> bytes:

@@ -14,8 +14,8 @@ class FrameSummary(BaseModel, frozen=True):
 
     timestamp_s: float
     segment: int
-    world_from_camera: list[list[float]]
-    intrinsics: list[list[float]] = Field(description="Pixels at source size.")
+    world_from_camera: list[list[float]] | None = Field(description="Null from a network without cameras.")
+    intrinsics: list[list[float]] | None = Field(description="Pixels at source size.")
     valid_fraction: float = Field(description="Part of the frame that has depth.")
     depth_range: tuple[float, float, float] | None = Field(description="5th, 50th and 95th percentile where valid.")
 
@@ -35,8 +35,8 @@ def summarise(frame: FrameDepth) -> FrameSummary:
     return FrameSummary(
         timestamp_s=frame.timestamp_s,
         segment=frame.segment,
-        world_from_camera=frame.world_from_camera.tolist(),
-        intrinsics=frame.intrinsics.tolist(),
+        world_from_camera=None if frame.world_from_camera is None else frame.world_from_camera.tolist(),
+        intrinsics=None if frame.intrinsics is None else frame.intrinsics.tolist(),
         valid_fraction=float(frame.valid.mean()),
         depth_range=(float(low), float(middle), float(high)) if depth.size else None,
     )

@@ -16,7 +16,7 @@ from bathyscope.result_files import save_npz
 from bathyscope.result_zip import load_zip
 from bathyscope.tum import read_tum
 from bathyscope_client.depth_colours import ClipRange, colour_depth, measure_range
-from bathyscope_client.outputs import output_paths, write_outputs
+from bathyscope_client.outputs import made_of, output_paths, write_outputs
 from bathyscope_client.point_cloud import VERTEX, steep
 from bathyscope_client.source_frames import source_frames
 from bathyscope_client.upload import pack_images
@@ -219,3 +219,27 @@ def test_a_file_that_is_no_video_is_a_clip_error(tmp_path: Path) -> None:
     (tmp_path / "a.mp4").write_bytes(b"text")
     with pytest.raises(ClipError, match=r"a\.mp4"):
         list(source_frames(tmp_path / "a.mp4"))
+
+
+def test_a_result_of_disparity_alone_gives_pictures_and_no_cameras(tmp_path: Path) -> None:
+    source = write_video(tmp_path / "source.mp4", 3, SIZE)
+    paths = output_paths(tmp_path, "colon")
+    meta = ResultMeta(name="colon", outputs=("disparity",), scale="affine")
+    seen = [plane(t, SIZE) for t in range(3)]
+    disparity = [
+        FrameDepth(f.index, f.timestamp_s, f.valid / np.maximum(f.depth, 1), None, f.valid, None, None) for f in seen
+    ]
+    save_npz(paths["depth"], ClipDepth.from_frames(disparity, meta))
+    write_outputs(source, paths, 100, lambda done, total: None)
+    assert {kind for kind, path in paths.items() if path.is_file()} == set(made_of(meta))
+    assert set(made_of(meta)) == {"depth", "pictures", "preview", "sheet"}
+
+
+def test_disparity_is_coloured_as_its_inverse() -> None:
+    depth = plane(0, SIZE)
+    flipped = FrameDepth(0, 0.0, depth.valid / np.maximum(depth.depth, 1), None, depth.valid, None, None)
+    span, other = measure_range([depth]), measure_range([flipped], disparity=True)
+    assert (other.near, other.far) == (pytest.approx(span.near, rel=1e-5), pytest.approx(span.far, rel=1e-5))
+    expected = colour_depth(depth.depth, depth.valid, span)
+    observed = colour_depth(flipped.depth, flipped.valid, other)
+    assert np.abs(expected.astype(int) - observed).max() <= 2

@@ -311,3 +311,49 @@ def test_maps_in_a_zip_that_are_not_of_the_stated_size_are_refused(tmp_path: Pat
             new.writestr(name, data)
     with pytest.raises(ResultError, match=r"depth/000000\.png is \(6, 9\), result\.json says \(6, 8\)"):
         load_zip(other)
+
+
+def without_cameras(frames: int = 4) -> ClipDepth:
+    whole = result(frames)
+    meta = META.model_copy(update={"outputs": ("disparity",), "scale": "affine"})
+    return ClipDepth(whole.depth, None, whole.valid, None, None, whole.timestamps_s, whole.segment, meta)
+
+
+@pytest.mark.parametrize("ending", ["npz", "zip"])
+def test_a_result_without_cameras_keeps_what_it_has_and_has_no_more(tmp_path: Path, ending: str) -> None:
+    clip = without_cameras()
+    path = tmp_path / f"a.{ending}"
+    found = load_npz(save_npz(path, clip)) if ending == "npz" else load_zip(save_zip(path, clip))
+    assert found.meta == clip.meta
+    assert (found.confidence, found.world_from_camera, found.intrinsics) == (None, None, None)
+    np.testing.assert_allclose(found.depth, clip.depth, atol=2**-12)
+    assert_array_equal(found.valid, clip.valid)
+    with zipfile.ZipFile(path) as archive:
+        names = " ".join(archive.namelist())
+    for absent in ("confidence", "world_from_camera", "intrinsics.npy", "poses.txt"):
+        assert absent not in names
+
+
+def test_meta_data_that_promises_cameras_which_are_not_there_is_refused(tmp_path: Path) -> None:
+    clip = without_cameras()
+    with pytest.raises(GeometryError, match=r"outputs \('depth', 'confidence', 'cameras'\); confidence is missing"):
+        ClipDepth(clip.depth, None, clip.valid, None, None, clip.timestamps_s, clip.segment, META)
+    with NpzWriter(tmp_path / "a.npz") as writer:
+        writer.append(clip.frame(0))
+        with pytest.raises(GeometryError, match=r"frame 0 has .* before have"):
+            writer.append(result().frame(0))
+        with pytest.raises(ResultError, match="its meta data says"):
+            writer.close(META)
+    with pytest.raises(GeometryError, match="1 of 2 frames lack"):
+        ClipDepth.from_frames([clip.frame(0), result(4).frame(1)], META)
+
+
+def test_results_of_the_first_format_are_still_read(tmp_path: Path) -> None:
+    clip = result()
+    old = clip.meta.model_dump(mode="json") | {"format": 1}
+    del old["outputs"]
+    arrays = {name: getattr(clip, name) for name in ARRAY_NAMES}
+    np.savez(tmp_path / "old.npz", **arrays, meta=np.array(json.dumps(old)))
+    found = load_npz(tmp_path / "old.npz")
+    assert found.meta.outputs == ("depth", "confidence", "cameras")
+    assert_array_equal(found.world_from_camera, clip.world_from_camera)

@@ -45,7 +45,8 @@ class VideoDepthAnything(nn.Module):
         b, t, _, height, width = images.shape
         taps = self.pretrained(images.flatten(0, 1))
         values: Tensor = self.head(taps, self.pretrained.token_grid((height, width)), t, (height, width))
-        return values.unflatten(0, (b, t))
+        stacked: Tensor = values.unflatten(0, (b, t))
+        return stacked
 
 
 def normalised(images: Float[Tensor, "*n 3 h w"]) -> Float[Tensor, "*n 3 h w"]:
