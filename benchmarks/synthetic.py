@@ -9,8 +9,10 @@ import json
 import platform
 import time
 from statistics import median
+from typing import get_args
 
 from bathyscope_train.data.synthetic import DOMAINS, Domain, render_clip
+from bathyscope_train.data.synthetic.domain import Family
 
 
 def rates(domain: Domain, seeds: range, frames: int, size: tuple[int, int]) -> tuple[list[float], list[float]]:
@@ -27,6 +29,7 @@ def rates(domain: Domain, seeds: range, frames: int, size: tuple[int, int]) -> t
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--domain", choices=sorted(DOMAINS), default="source")
     parser.add_argument("--clips", type=int, default=6, help="clips of each family")
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--height", type=int, default=128)
@@ -35,15 +38,17 @@ def main() -> None:
     size = (options.height, options.width)
     result: dict[str, object] = {
         "benchmark": "synthetic",
+        "domain": options.domain,
         "size": size,
         "frames": options.frames,
         "clips": options.clips,
         "machine": platform.machine(),
     }
     every: list[float] = []
-    for family in ("lumen", "cavity", "sinus"):
-        domain = DOMAINS["source"].model_copy(update={"families": {family: 1.0}})
-        processor, wall = rates(domain, range(options.clips), options.frames, size)
+    domain = DOMAINS[options.domain]
+    for family in get_args(Family):
+        chosen = domain.model_copy(update={"families": {family: 1.0}})
+        processor, wall = rates(chosen, range(options.clips), options.frames, size)
         every += [options.frames / rate for rate in processor]
         result[family] = {"fps_processor": round(median(processor), 1), "fps_wall": round(median(wall), 1)}
     result["fps_processor_mean"] = round(options.frames * len(every) / sum(every), 1)

@@ -116,28 +116,26 @@ def test_normals_are_the_slope_of_the_distance_to_the_solid() -> None:
     shapes = [(BOX, (4.0, 3.0, 2.0)), (BALL, (3.0,) * 3), (FRUSTUM, (3.0, 3.0, 5.0)), (ROOM, (9.0, 8.0, 7.0))]
     for kind, size in shapes:
         solids = make_solids([Part(kind, np.eye(4), size, GREY)])
-        for ray in np.random.default_rng(2).normal(0, 1, (30, 3)):
-            ray /= np.linalg.norm(ray)
+        for direction in np.random.default_rng(2).normal(0, 1, (30, 3)):
+            ray = direction / np.linalg.norm(direction)
             start = 0.0 if kind == ROOM else 20.0
             way = ray if kind == ROOM else -ray
             t, _ = trace_solids(solids, 0.0, 1e9, *(start * ray), *way)
             point = start * ray + t * way
             observed = np.array(local_normal(kind, solids.size[0], *point))
             outside = point + 1e-3 * observed
-            steps = 1e-5 * np.eye(3)
-            slope = [
-                solid_clearance(solids, *(outside + step)) - solid_clearance(solids, *(outside - step))
-                for step in steps
-            ]
-            np.testing.assert_allclose(observed, np.array(slope) / 2e-5, atol=1e-3)
+            beyond, before = (
+                np.array([solid_clearance(solids, *(outside + s * d)) for d in 1e-5 * np.eye(3)]) for s in (1.0, -1.0)
+            )
+            np.testing.assert_allclose(observed, (beyond - before) / 2e-5, atol=1e-3)
 
 
 def test_movers_move_and_the_rest_stays() -> None:
     still = make_solids([Part(BALL, at(0.0, 0.0, 50.0), (5.0,) * 3, GREY)])
     moving = make_solids([Part(BALL, at(0.0, 0.0, 2.0), (1.0,) * 3, GREY, mover=1)])
     both = joined(still, placed(moving, at(3.0, 0.0, 10.0)[None]))
-    assert trace_solids(both, 0.0, 1e9, 0, 0, 0, 0, 0, 1) == (45.0, 0)
-    assert trace_solids(both, 0.0, 1e9, 3.0, 0, 0, 0, 0, 1) == (11.0, 1)
+    assert trace_solids(both, 0.0, 1e9, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0) == (45.0, 0)
+    assert trace_solids(both, 0.0, 1e9, 3.0, 0.0, 0.0, 0.0, 0.0, 1.0) == (11.0, 1)
     np.testing.assert_array_equal(moving.local_from_scene[0, :, 3], (0.0, 0.0, -2.0))
 
 
