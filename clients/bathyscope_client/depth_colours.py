@@ -80,7 +80,7 @@ def inverse(disparity: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def colour_depth(depth: NDArray[np.floating], valid: NDArray[np.bool_], span: ClipRange) -> NDArray[np.uint8]:
-    """RGB picture (h, w, 3) of a depth or disparity map, logarithmic from ``span.near`` (red) to ``span.far`` (blue)."""
+    """RGB picture (h, w, 3) of depth or disparity, logarithmic from ``span.near`` (red) to ``span.far`` (blue)."""
     near = max(span.near, 1e-12)
     width = max(np.log(max(span.far, near) / near), 1e-6)
     depth = inverse(depth) if span.disparity else depth
