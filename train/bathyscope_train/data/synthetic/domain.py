@@ -49,7 +49,7 @@ class LightRanges(_Ranges):
     """Angle between the beam's axis and the lens's."""
     coned: Share = 0.0
     """Share of clips whose beam has an edge."""
-    cone_deg: Range = (28.0, 55.0)
+    cone_deg: Range = (34.0, 60.0)
     """Angle of that edge from the beam's axis."""
     edge_deg: Range = (4.0, 18.0)
     """Half width of the edge."""
@@ -210,7 +210,7 @@ class SensorRanges(_Ranges):
     """Share of clips with a wrong white balance."""
     warmth: Range = (-0.3, 0.3)
     """Logarithm of red over blue."""
-    tint: Range = (-0.08, 0.06)
+    tint: Range = (-0.08, 0.03)
     """Logarithm of green over the mean of red and blue."""
     drift: Range = (0.0, 0.08)
     """Amplitude with which both wander during a clip."""

@@ -26,7 +26,7 @@ BROAD = Domain(
         second_light=0.4,
         ambient=(0.0, 0.05),
         tilt_deg=(0.0, 12.0),
-        coned=0.25,
+        coned=0.2,
     ),
     material=MaterialRanges(
         red=(0.35, 0.95),
@@ -72,7 +72,7 @@ BROAD = Domain(
     sensor=SensorRanges(
         gamma=(1.6, 2.5),
         exposure=(0.27, 0.62),
-        metering=(35.0, 85.0),
+        metering=(40.0, 88.0),
         lag=(0.0, 0.7),
         vignette=(0.0, 0.9),
         clipping=(0.85, 1.4),
