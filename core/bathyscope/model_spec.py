@@ -10,6 +10,7 @@ from typing import Literal
 
 from pydantic import BaseModel, Field, PositiveFloat, PositiveInt, model_validator
 
+from bathyscope.depth_range import DepthRange
 from bathyscope.keyed_windows import KeyedWindows
 
 Kind = Literal["scene", "video"]
@@ -52,6 +53,11 @@ class ResizeSpec(_Strict):
 
     least: tuple[PositiveInt, PositiveInt] = Field(description="Height and width that the input has at least.")
     lower_long: bool = Field(default=False, description="Lower `least` for frames longer than 16:9.")
+    back: Literal["corners", "centres"] = Field(
+        default="corners",
+        description="How values go back to the size of the frame, bilinearly: 'corners' keeps the values of the corner "
+        "pixels, 'centres' has the centre of the first pixel at (0.5, 0.5), as OpenCV has.",
+    )
 
 
 class VideoSpec(_Strict):
@@ -64,9 +70,16 @@ class VideoSpec(_Strict):
     unit: Literal["m", "mm"] | None = Field(default=None, description="Of metric values.")
     resize: ResizeSpec
     windows: KeyedWindows | None = Field(description="How windows are cut and stitched; null: frame by frame.")
+    depth_range: DepthRange | None = Field(
+        default=None,
+        description="The network says disparity between two depths, and that is resized and stitched; it becomes depth "
+        "last, frame by frame, by this range. `quantity` is 'depth' then.",
+    )
 
     @model_validator(mode="after")
     def _unit_fits(self) -> VideoSpec:
+        if self.depth_range is not None and self.quantity != "depth":
+            raise ValueError(f"with a depth_range the quantity is 'depth', got {self.quantity!r}")
         if (self.scale == "metric") != (self.unit is not None):
             raise ValueError(f"metric values, and only they, have a unit; scale is {self.scale!r}, unit {self.unit!r}")
         return self

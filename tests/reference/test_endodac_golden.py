@@ -14,7 +14,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from bathyscope_train.systems.depth_anything.disparity import DepthRange
+from bathyscope.depth_range import DepthRange
 from bathyscope_train.systems.endodac import DepthNetwork, DepthSettings
 
 REFERENCE = Path(os.environ.get("BATHYSCOPE_REFERENCE", Path(__file__).parents[2] / "../shared/reference"))

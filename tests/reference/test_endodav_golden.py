@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from bathyscope.affine_stitch import AffineStitcher
 from bathyscope.clip import Clip
+from bathyscope.depth_range import DepthRange
 from bathyscope.keyed_windows import keyed_windows
 from bathyscope.resizing import resize_corners
-from bathyscope_train.systems.depth_anything.disparity import DepthRange
 from bathyscope_train.systems.endodav import EndoDav, EndoDavSettings
 from bathyscope_train.systems.endodav.system import endodav_system
 from bathyscope_train.systems.vda.settings import VdaSettings

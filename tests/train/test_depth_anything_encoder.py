@@ -6,8 +6,9 @@ import pytest
 import torch
 import torch.nn.functional as F
 
+from bathyscope.depth_range import DepthRange
 from bathyscope.errors import GeometryError
-from bathyscope_train.systems.depth_anything.disparity import DepthRange, SigmoidPyramid
+from bathyscope_train.systems.depth_anything.disparity import SigmoidPyramid
 from bathyscope_train.systems.depth_anything.encoder import Encoder
 from bathyscope_train.systems.depth_anything.neck import NeckBlock, add_necks
 from bathyscope_train.systems.depth_anything.positions import resized_positions

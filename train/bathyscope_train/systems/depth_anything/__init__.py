@@ -7,7 +7,9 @@
     pyramid.py     the DPT trunk: four tapped layers to four fused paths, with a place for something between them
     adapters.py    linear layers with low-rank or scaling adapters, and how to merge them away
     neck.py        the convolutional neck after chosen blocks
-    disparity.py   sigmoid disparity heads, and from disparity to depth
+    disparity.py   sigmoid disparity heads
+    option_sets.py which adapters and necks a checkpoint has, by its keys
+    schedule.py    what is trained of an adapted network, and when
 
-Parameters are named as in the published checkpoints.
+From disparity to depth: :mod:`bathyscope.depth_range`. Parameters are named as in the published checkpoints.
 """

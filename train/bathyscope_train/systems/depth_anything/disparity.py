@@ -1,39 +1,14 @@
-"""Sigmoid disparities at four scales, and what a disparity of these networks means."""
+"""Sigmoid disparities at four scales."""
 
 from collections.abc import Sequence
-from typing import TypeVar
 
-import numpy as np
 from jaxtyping import Float
-from numpy.typing import NDArray
-from pydantic import BaseModel, PositiveFloat
 from torch import Tensor, nn
 
 from bathyscope_train.model.dense_head import resize_bilinear
 from bathyscope_train.systems.depth_anything.pyramid import Pyramid
 
 _HIDDEN = 32
-
-Values = TypeVar("Values", Tensor, NDArray[np.float32])
-
-
-class DepthRange(BaseModel, frozen=True, extra="forbid"):
-    """The depths, in the network's own unit, that a disparity of 1 and of 0 stand for."""
-
-    nearest: PositiveFloat = 0.1
-    farthest: PositiveFloat = 150.0
-
-    def scaled(self, disparity: Values) -> Values:
-        """Inverse depth: ``1 / farthest + (1 / nearest - 1 / farthest) * disparity``.
-
-        A disparity above 1, which networks without a sigmoid give, lies nearer than ``nearest``.
-        """
-        low, high = 1 / self.farthest, 1 / self.nearest
-        return low + (high - low) * disparity
-
-    def depth(self, disparity: Values) -> Values:
-        """Depth of a network disparity: one over :meth:`scaled`."""
-        return 1 / self.scaled(disparity)
 
 
 class Doubling(nn.Module):

@@ -6,8 +6,8 @@ from typing import Annotated, Self
 
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveInt, model_validator
 
+from bathyscope.depth_range import DepthRange
 from bathyscope_train.systems.depth_anything.adapters import AdapterKind
-from bathyscope_train.systems.depth_anything.disparity import DepthRange
 
 PATCH = 14
 TAPPED = 4

@@ -4,8 +4,8 @@ from typing import Literal, Self
 
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveInt, model_validator
 
+from bathyscope.depth_range import DepthRange
 from bathyscope_train.systems.depth_anything.adapters import AdapterKind
-from bathyscope_train.systems.depth_anything.disparity import DepthRange
 from bathyscope_train.systems.vda.settings import SIZES, VdaSettings
 
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from bathyscope.bundle import hash_file
 from bathyscope.camera import F64
 from bathyscope.clip import FrameSequence
+from bathyscope.depth_range import DepthRange
 from bathyscope.keyed_windows import KeyedWindows
 from bathyscope.vision.shorter_side import covering_size, to_network
-from bathyscope_train.systems.depth_anything.disparity import DepthRange
 from bathyscope_train.systems.endodav.loading import describe, load_endodav
 from bathyscope_train.systems.endodav.network import EndoDav
 from bathyscope_train.systems.options import refuse_options
