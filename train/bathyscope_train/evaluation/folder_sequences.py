@@ -103,7 +103,8 @@ def known_unit(text: str | None) -> Unit:
 def open_folders(name: str, root: Path) -> EvaluationSet:
     """A data set folder, or a folder of them; see :class:`DatasetFolder` for the layout.
 
-    Folders inside ``root`` that are not in the layout are named as gaps.
+    Folders inside ``root`` that hold ``frames/`` or ``intrinsics.json`` and are still not in the layout are named as
+    gaps; others are not looked at.
 
     Raises:
         DatasetError: If there is no data set folder at all; says why.
@@ -113,12 +114,16 @@ def open_folders(name: str, root: Path) -> EvaluationSet:
     if not root.is_dir():
         raise DatasetError(f"{root}: no such folder")
     sequences, gaps = [], []
-    for path in sorted(path for path in root.iterdir() if path.is_dir() and not path.name.startswith(".")):
+    for path in sorted(path for path in root.iterdir() if _looks_like_data(path)):
         try:
             sequences.append(FolderSequence(DatasetFolder.open(path), path.name))
         except DatasetError as error:
             gaps.append(Gap(path.name, "", str(error)))
     if not sequences:
-        reasons = "; ".join(gap.reason for gap in gaps) or "it holds no folders"
+        reasons = "; ".join(gap.reason for gap in gaps) or "no folder in it holds frames/ or intrinsics.json"
         raise DatasetError(f"{root}: no frames/ in it, and no data set folder below it: {reasons}")
     return EvaluationSet(name, tuple(sequences), f"{len(sequences)} folders", tuple(gaps))
+
+
+def _looks_like_data(path: Path) -> bool:
+    return (path / "frames").is_dir() or (path / "intrinsics.json").is_file()

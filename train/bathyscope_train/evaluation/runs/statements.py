@@ -26,8 +26,8 @@ def data_statement(label: str, chosen: EvaluationSet, lines: Sequence[Line]) -> 
     known = next((line for line in lines if line.parts), None)
     which = "" if group == ALL_FRAMES else f", {group} only"
     text = (
-        f"{label}{which}: {chosen.split}; split hash {chosen.split_hash}; {len(chosen.sequences)} sequences, "
-        f"{chosen.frame_count} frames"
+        f"{label}{which}: {chosen.split}; split hash {chosen.split_hash}; "
+        f"{counted(len(chosen.sequences), 'sequence')}, {counted(chosen.frame_count, 'frame')}"
     )
     if known is None:
         return f"{text}."
@@ -43,8 +43,13 @@ def data_statement(label: str, chosen: EvaluationSet, lines: Sequence[Line]) -> 
     notes = dict.fromkeys(note for sequence in chosen.sequences for note in sequence.notes)
     text += "".join(f"; {note}" for note in notes)
     if chosen.gaps:
-        text += f"; {len(chosen.gaps)} gaps, listed below"
+        text += f"; {counted(len(chosen.gaps), 'gap')}, listed below"
     return f"{text}."
+
+
+def counted(number: int, what: str) -> str:
+    """``1 frame``, ``2 frames``."""
+    return f"{number:,} {what}" if number == 1 else f"{number:,} {what}s"
 
 
 def system_statement(line: Line) -> str:
@@ -73,7 +78,7 @@ def incomplete_statement(line: Line) -> str | None:
     if line.missing is None and not line.complete:
         parts.append(f"{line.measured_sequences} of {line.sequences} sequences have numbers")
     if line.left_out:
-        parts.append(f"of {line.frames} frames without numbers: {line.left_out}")
+        parts.append(f"of {counted(line.frames, 'frame')} without numbers: {line.left_out}")
     if np.isfinite(line.coverage) and line.coverage < 1:
         parts.append(f"predicts {line.coverage:.2%} of the pixels with truth")
     return f"{line.system}: {'; '.join(parts)}." if parts else None
