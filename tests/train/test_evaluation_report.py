@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from bathyscope.engines import DepthOptions
 from bathyscope.errors import DatasetError
+from bathyscope.model_spec import Output
 from bathyscope.result import BundleId, FrameDepth, ResultMeta
 from bathyscope_train.evaluation.cli import app
 from bathyscope_train.evaluation.evaluate import evaluate
@@ -70,13 +71,13 @@ class Run:
         for t in range(min(self.options.max_frames, self.engine.frames)):
             depth = self.engine.maps[self.options.depth](t).astype(np.float32)
             k = np.array([[1.5 * FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1]])
-            pose = self.engine.pose(t)
+            pose = None if self.engine.pose is None else self.engine.pose(t)
             valid = np.ones(depth.shape, np.bool_)
             segment = int(t >= self.engine.cut)
-            yield FrameDepth(t, t / 25, depth, np.ones_like(depth), valid, pose, k, segment)
+            yield FrameDepth(t, t / 25, depth, np.ones_like(depth), valid, pose, None if pose is None else k, segment)
 
     def meta(self) -> ResultMeta:
-        return ResultMeta(warnings=("as told",))
+        return ResultMeta(warnings=("as told",), outputs=self.engine.outputs)
 
     def close(self) -> None:
         self.closed = True
@@ -89,7 +90,8 @@ class Oracle:
     maps: dict[str, Maps] = field(
         default_factory=lambda: {"rendered": lambda t: true_depth(t) / 50, "head": lambda t: true_depth(t) / 7}
     )
-    pose: Maps = true_pose
+    pose: Maps | None = true_pose
+    outputs: tuple[Output, ...] = ("depth", "confidence", "cameras")
     frames: int = T
     cut: int = T
     runs: list[Run] = field(default_factory=list)
@@ -125,6 +127,7 @@ def test_a_prediction_right_up_to_scale_is_perfect_and_beats_both_guesses(tmp_pa
     assert rendered.poses.true_translation_mean == pytest.approx(6 * np.hypot(0.5, 2))
     assert rendered.poses.pairs == T - 6
     assert rendered.poses.pose_scale_over_depth_scale == pytest.approx(1, rel=1e-5)
+    assert rendered.focal is not None
     assert (rendered.focal.fx_ratio, rendered.focal.fy_ratio) == (1.5, 1.0)
     assert rendered.warnings == ("as told",)
 
@@ -170,6 +173,18 @@ def test_frames_without_truth_are_counted_out(tmp_path: Path) -> None:
 def test_without_poses_there_are_no_pose_scores(tmp_path: Path) -> None:
     report = evaluate(Oracle(), [dataset(tmp_path / "a", poses=False)], kinds=["head"])
     assert report.datasets[0].network["head"].poses is None
+
+
+def test_a_model_without_cameras_has_depth_scores_alone(tmp_path: Path) -> None:
+    part = evaluate(Oracle(pose=None), [dataset(tmp_path / "a")], kinds=["head"]).datasets[0].network["head"]
+    assert (part.poses, part.focal) == (None, None)
+    assert part.depth.abs_rel == pytest.approx(0, abs=1e-6)
+
+
+def test_disparity_is_inverted_before_it_is_scaled(tmp_path: Path) -> None:
+    oracle = Oracle({"head": lambda t: 50 / true_depth(t)}, pose=None, outputs=("disparity",))
+    scores = evaluate(oracle, [dataset(tmp_path / "a")], kinds=["head"]).datasets[0].network["head"].depth
+    assert scores.abs_rel == pytest.approx(0, abs=1e-6)
 
 
 def test_segments_are_aligned_one_by_one_and_no_pair_crosses_a_cut(tmp_path: Path) -> None:

@@ -46,8 +46,8 @@ class Prediction:
     """What the engine says of a folder."""
 
     depth: Samples
-    world_from_camera: F64
-    intrinsics: F64
+    cameras: tuple[F64, F64] | None
+    """``world_from_camera`` and intrinsics of every frame; ``None`` from a model without cameras."""
     segment: NDArray[np.int32]
     meta: ResultMeta
 
@@ -164,21 +164,25 @@ def _predict(engine: Engine, folder: DatasetFolder, kind: DepthKind, frames: int
         for frame in run:
             if frame.depth.shape != folder.calibration.size:
                 raise DatasetError(f"{folder.path}: depth came back as {frame.depth.shape}, not of the frames' size")
-            known = folder.truth.at(len(poses))
+            known = folder.truth.at(len(segment))
             values = np.where(frame.valid, frame.depth, 0.0)[known.rows, known.columns]
             samples.append(values.astype(np.float32))
-            poses.append(frame.world_from_camera)
-            intrinsics.append(frame.intrinsics)
+            if frame.world_from_camera is not None and frame.intrinsics is not None:
+                poses.append(frame.world_from_camera)
+                intrinsics.append(frame.intrinsics)
             segment.append(frame.segment)
-            progress(f"{folder.name}: {kind} depth", len(poses), frames)
+            progress(f"{folder.name}: {kind} depth", len(segment), frames)
         meta = run.meta()
     finally:
         run.close()
-    if len(poses) != frames:
+    if len(segment) != frames:
         raise DatasetError(
-            f"{folder.path}: {frames} frames went in, {len(poses)} came back: {'; '.join(meta.warnings)}"
+            f"{folder.path}: {frames} frames went in, {len(segment)} came back: {'; '.join(meta.warnings)}"
         )
-    return Prediction(samples, np.stack(poses), np.stack(intrinsics), np.array(segment, np.int32), meta)
+    if "disparity" in meta.outputs:
+        samples = [np.divide(1, part, out=np.zeros_like(part), where=part > 0) for part in samples]
+    cameras = (np.stack(poses), np.stack(intrinsics)) if len(poses) == frames else None
+    return Prediction(samples, cameras, np.array(segment, np.int32), meta)
 
 
 def _network_report(
@@ -190,17 +194,17 @@ def _network_report(
 ) -> NetworkReport:
     depth = depth_scores(truth, prediction.depth, keep)
     true = folder.calibration
-    true_poses = TruePoses(folder.world_from_camera, true.pose_unit, true.depth_unit)
-    return NetworkReport(
-        depth=depth,
-        poses=pose_scores(true_poses, prediction.world_from_camera, prediction.segment, gap, depth.scale),
-        focal=FocalScores(
-            fx_ratio=float(np.median(prediction.intrinsics[:, 0, 0])) / true.fx,
-            fy_ratio=float(np.median(prediction.intrinsics[:, 1, 1])) / true.fy,
-        ),
-        segments=len(np.unique(prediction.segment)),
-        warnings=prediction.meta.warnings,
-    )
+    poses, focal = None, None
+    if prediction.cameras is not None:
+        world_from_camera, intrinsics = prediction.cameras
+        true_poses = TruePoses(folder.world_from_camera, true.pose_unit, true.depth_unit)
+        poses = pose_scores(true_poses, world_from_camera, prediction.segment, gap, depth.scale)
+        focal = FocalScores(
+            fx_ratio=float(np.median(intrinsics[:, 0, 0])) / true.fx,
+            fy_ratio=float(np.median(intrinsics[:, 1, 1])) / true.fy,
+        )
+    segments = len(np.unique(prediction.segment))
+    return NetworkReport(depth=depth, poses=poses, focal=focal, segments=segments, warnings=prediction.meta.warnings)
 
 
 def _mean_over_folders(reports: Sequence[FolderReport]) -> dict[str, DepthScores]:

@@ -90,7 +90,8 @@ class NetworkReport(_Strict):
 
     depth: DepthScores
     poses: PoseScores | None
-    focal: FocalScores
+    focal: FocalScores | None
+    """Null from a model without cameras, as poses are."""
     segments: int
     """More than one: the engine saw a cut, and the depth scale may jump there. One scale is used all the same."""
     warnings: tuple[str, ...]

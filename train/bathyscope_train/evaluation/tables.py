@@ -81,8 +81,10 @@ def _pose_table(parts: Mapping[str, NetworkReport]) -> Table:
 
 
 def _print_notes(name: str, part: NetworkReport, console: Console) -> None:
-    ratios = f"{_text(part.focal.fx_ratio)} (x), {_text(part.focal.fy_ratio)} (y)"
-    console.print(f"{name}: predicted / true focal length {ratios}; segments: {part.segments}", highlight=False)
+    focal = "no cameras"
+    if part.focal is not None:
+        focal = f"predicted / true focal length {_text(part.focal.fx_ratio)} (x), {_text(part.focal.fy_ratio)} (y)"
+    console.print(f"{name}: {focal}; segments: {part.segments}", highlight=False)
     for warning in part.warnings:
         console.print(f"{name}: {warning}", highlight=False, markup=False)
 
