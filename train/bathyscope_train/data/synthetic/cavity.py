@@ -7,7 +7,7 @@ import numpy.typing as npt
 from bathyscope_train.data.synthetic.domain import MaterialRanges
 from bathyscope_train.data.synthetic.noise import periodic_noise
 from bathyscope_train.data.synthetic.scene import FIELD, Scene, make_surface
-from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette
+from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette, without_streaks
 
 Array = npt.NDArray[np.float32]
 
@@ -50,6 +50,8 @@ def cavity(random: np.random.Generator, material: MaterialRanges) -> Scene:
     tissue = make_tissue(
         random, material, np.asarray(albedo, np.float32), (extent, extent), wrap=False, vessel_step_mm=0.3, grain=1.6
     )
+    if material.fading:
+        tissue = without_streaks(tissue, np.asarray(albedo, np.float32), surface)
     return Scene("cavity", surface, tissue)
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from bathyscope_train.data.synthetic.domain import MaterialRanges
 from bathyscope_train.data.synthetic.noise import periodic_noise
 from bathyscope_train.data.synthetic.scene import FIELD, Scene, Stage, make_surface, smooth_field
-from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette
+from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette, without_streaks
 
 _SAMPLES = 400
 
@@ -54,4 +54,4 @@ def closeup(random: np.random.Generator, material: MaterialRanges) -> Scene:
     target = (0.0, 0.0, float(heights[_SAMPLES // 2, _SAMPLES // 2]))
     spread = (0.12 * extent, 0.12 * extent, 0.0)
     stage = Stage(target, spread, (0.09 * extent, 0.34 * extent), (0.0, 58.0), margin_mm=0.03 * extent)
-    return Scene("closeup", surface, tissue, stage=stage)
+    return Scene("closeup", surface, without_streaks(tissue, albedo, surface), stage=stage)

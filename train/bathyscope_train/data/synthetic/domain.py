@@ -82,6 +82,8 @@ class MaterialRanges(_Ranges):
     vessels: Range = (25.0, 60.0)
     """Vessel trees a scene."""
     vessel_contrast: Range = (0.25, 0.6)
+    fading: bool = False
+    """Whether a cavity's vessels and films fade on steep walls, where their map stretches them into streaks."""
     palettes: tuple[Palette, ...] = ()
     """Other palettes, each as likely for a scene as the one above."""
     regions: Range = (0.0, 0.0)

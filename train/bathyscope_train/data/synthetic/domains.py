@@ -47,6 +47,7 @@ BROAD = Domain(
         spots=(0.0, 0.25),
         vessels=(0.0, 70.0),
         vessel_contrast=(0.1, 0.75),
+        fading=True,
         regions=(0.0, 1.8),
         banded=0.2,
         bloody=0.15,

@@ -6,7 +6,7 @@ import numpy.typing as npt
 from bathyscope_train.data.synthetic.domain import MaterialRanges
 from bathyscope_train.data.synthetic.noise import periodic_noise
 from bathyscope_train.data.synthetic.scene import FIELD, Scene, Stage, make_surface, smooth_field
-from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette
+from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette, without_streaks
 
 Array = npt.NDArray[np.float32]
 
@@ -71,7 +71,7 @@ def larynx(random: np.random.Generator, material: MaterialRanges) -> Scene:
     size_mm = (_EXTENT_MM, _EXTENT_MM)
     tissue = make_tissue(random, material, albedo, size_mm, wrap=False, vessel_step_mm=0.12, grain=0.6)
     stage = Stage((0.0, 0.0, _FOLDS_MM), (4.0, 5.0, 3.0), (9.0, 34.0), (0.0, 28.0), margin_mm=2.2)
-    return Scene("larynx", surface, tissue, stage=stage)
+    return Scene("larynx", surface, without_streaks(tissue, albedo, surface), stage=stage)
 
 
 def _epiglottis(random: np.random.Generator, x: Array, y: Array, front: float) -> Array:

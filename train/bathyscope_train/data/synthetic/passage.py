@@ -7,7 +7,7 @@ import numpy.typing as npt
 from bathyscope_train.data.synthetic.domain import MaterialRanges
 from bathyscope_train.data.synthetic.noise import periodic_noise
 from bathyscope_train.data.synthetic.scene import FIELD, Scene, Stage, make_surface, smooth_field
-from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette
+from bathyscope_train.data.synthetic.tissue import blend, make_tissue, palette, without_streaks
 
 Array = npt.NDArray[np.float32]
 
@@ -58,4 +58,4 @@ def passage(random: np.random.Generator, material: MaterialRanges) -> Scene:
     tissue = make_tissue(random, material, albedo, (extent, extent), wrap=False, vessel_step_mm=0.1, grain=0.6)
     spread = (0.5 * wide, 0.5 * tall, 0.0)
     stage = Stage((0.0, 0.0, 0.62 * deep), spread, (0.25 * deep, 0.75 * deep), (0.0, 22.0), margin_mm=0.035 * extent)
-    return Scene("sinus", surface, tissue, stage=stage)
+    return Scene("sinus", surface, without_streaks(tissue, albedo, surface), stage=stage)

@@ -7,13 +7,14 @@ import numpy.typing as npt
 from bathyscope_train.data.synthetic.domain import MaterialRanges, draw
 from bathyscope_train.data.synthetic.films import Patch, coat_surface
 from bathyscope_train.data.synthetic.noise import gradient_noise, periodic_noise
-from bathyscope_train.data.synthetic.scene import Tissue
+from bathyscope_train.data.synthetic.scene import Surface, Tissue
 from bathyscope_train.data.synthetic.vessels import vessel_map
 
 Array = npt.NDArray[np.float32]
 
 _SOLID = 56
 _SOLID_STEP_MM = 0.4
+_STEEP = 2.0  # slope at which half of the vessels are left
 
 
 def palette(random: np.random.Generator, material: MaterialRanges) -> Array:
@@ -99,4 +100,26 @@ def make_tissue(
         region_level=float(wetness.uniform(-0.7, 0.7)),
         fine=draw(wetness, material.fine),
         capillaries=draw(wetness, material.capillaries),
+    )
+
+
+def without_streaks(tissue: Tissue, bare: Array, surface: Surface) -> Tissue:
+    """The tissue of a field with vessels and films faded on steep walls, where their map would stretch them.
+
+    Args:
+        tissue: What ``make_tissue`` gave.
+        bare: Colours without films, ``(rows, columns, 3)``.
+        surface: The field.
+    """
+    slope = np.hypot(*np.gradient(surface.heights, *surface.step))
+    keep = np.asarray(1.0 / (1.0 + (slope / _STEEP) ** 4), np.float32)
+    levels = [
+        np.ascontiguousarray(level * cv2.resize(keep, level.shape[::-1], interpolation=cv2.INTER_AREA))
+        for level in tissue.vessels
+    ]
+    even = tissue.gloss.shape != keep.shape
+    return tissue._replace(
+        albedo=np.ascontiguousarray(bare + keep[..., None] * (tissue.albedo - bare)),
+        vessels=(levels[0], levels[1], levels[2], levels[3]),
+        gloss=tissue.gloss if even else np.ascontiguousarray(1.0 + keep * (tissue.gloss - 1.0), np.float32),
     )
