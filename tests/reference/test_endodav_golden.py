@@ -132,6 +132,15 @@ def test_merging_leaves_no_adapter_and_the_same_disparities(folder: Path) -> Non
             torch.testing.assert_close(observed, expected, atol=1e-5 * float(expected.abs().max()), rtol=0)
 
 
+@every_case
+def test_the_two_stages_of_an_exported_network_give_the_finest_disparity(folder: Path) -> None:
+    case = run(folder)
+    with torch.no_grad():
+        maps = case.network.mixed(torch.from_numpy(case.arrays["input"][0]))
+        alone = [case.network.finish(*(each[i : i + 1] for each in maps)) for i in range(len(maps[0]))]
+    assert_close(torch.cat(alone), case.arrays["disp_0"][:, 0])
+
+
 @cache
 def video(folder: Path) -> dict[str, np.ndarray]:
     with np.load(folder / "video.npz") as file:

@@ -14,7 +14,7 @@ from bathyscope.errors import CheckpointError
 from bathyscope.vision.shorter_side import covering_size
 from bathyscope_train.systems import open_system
 from bathyscope_train.systems.endodav import EndoDav, EndoDavSettings
-from bathyscope_train.systems.endodav.loading import load_endodav
+from bathyscope_train.systems.endodav.loading import load_endodav, start_from_vda
 from bathyscope_train.systems.endodav.system import WINDOWS, EndoDavSystem, endodav_system
 from bathyscope_train.systems.endodav.training import parameters, turn
 from bathyscope_train.systems.vda.network import VideoDepthAnything
@@ -87,16 +87,30 @@ def test_a_sigmoid_output_stays_below_one() -> None:
     assert ((disparity > 0) & (disparity < 1)).all()
 
 
-def test_weights_of_video_depth_anything_load_into_the_plain_parts() -> None:
+def test_training_starts_from_video_depth_anything(tmp_path: Path) -> None:
     torch.manual_seed(1)
     plain = VideoDepthAnything(SIZE).eval()
-    adapted = network_of()
-    missing, unexpected = adapted.load_state_dict(plain.state_dict(), strict=False)
-    assert not unexpected
-    assert all("lora_" in name for name in missing)
+    torch.save(plain.state_dict(), tmp_path / "vda.pth")
+    adapted = network_of(SMALL.model_copy(update={"neck": (1, 3)}))
+    start_from_vda(adapted, tmp_path / "vda.pth")
     images = torch.rand(1, 3, 3, 28, 42)
     with torch.no_grad():
         torch.testing.assert_close(adapted.disparity(images), plain(images), atol=1e-5, rtol=0)
+
+
+def test_training_of_the_sigmoid_head_starts_from_video_depth_anything_but_its_output(tmp_path: Path) -> None:
+    plain = VideoDepthAnything(SIZE)
+    torch.save(plain.state_dict(), tmp_path / "vda.pth")
+    adapted = network_of(SMALL.model_copy(update={"head": "sigmoid"}))
+    start_from_vda(adapted, tmp_path / "vda.pth")
+    assert torch.equal(adapted.pretrained.norm.weight, plain.pretrained.norm.weight)
+    assert torch.equal(adapted.head.projects[0].weight, plain.head.projects[0].weight)
+
+
+def test_training_does_not_start_from_weights_of_another_size(tmp_path: Path) -> None:
+    torch.save({"pretrained.norm.weight": torch.zeros(3)}, tmp_path / "vda.pth")
+    with pytest.raises(CheckpointError, match="is no Video Depth Anything of width 16: it lacks"):
+        start_from_vda(network_of(), tmp_path / "vda.pth")
 
 
 def test_temporal_adapters_take_turns_with_spatial_ones() -> None:

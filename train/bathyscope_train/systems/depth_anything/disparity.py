@@ -61,3 +61,9 @@ class SigmoidPyramid(Pyramid):
     ) -> tuple[Float[Tensor, "n 1 h2 w2"], ...]:
         """Disparities of single images from tapped tokens, fine to coarse."""
         return self.disparities(self.paths(taps, grid))
+
+    def finish(self, path3: Float[Tensor, "n c h3 w3"], level2: Tensor, level1: Tensor) -> Float[Tensor, "n h w"]:
+        """The finest disparity alone, from what the fine half reads."""
+        path1, _ = self.fine(path3, level2, level1)
+        disparity: Tensor = self.conv_depth_1(path1)
+        return disparity[:, 0]

@@ -41,10 +41,20 @@ class DepthNetwork(nn.Module):
         disparities: tuple[Tensor, ...] = self.depth_head(self.encoder(resized), self.settings.token_grid)
         return disparities
 
+    def mixed(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
+        """First stage of an exported network: all that :meth:`finish` reads of images in [0, 1]."""
+        taps = self.encoder(resize_bilinear(images, self.settings.image_size))
+        levels = self.depth_head.levels(taps, self.settings.token_grid)
+        path3, _ = self.depth_head.coarse(levels)
+        return path3, levels[1], levels[0]
+
+    def finish(self, path3: Tensor, level2: Tensor, level1: Tensor) -> Float[Tensor, "n h2 w2"]:
+        """Second stage, which takes most memory and may run in chunks of images: disparity of the finest scale."""
+        return self.depth_head.finish(path3, level2, level1)
+
     def scaled_disparity(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h2 w2"]:
         """Inverse depth at the finest scale: what published evaluation resizes before it inverts."""
-        finest: Tensor = self(images)[0][:, 0]
-        return self.settings.depth_range.scaled(finest)
+        return self.settings.depth_range.scaled(self.finish(*self.mixed(images)))
 
     def depth(self, images: Float[Tensor, "n 3 h w"]) -> Float[Tensor, "n h2 w2"]:
         """Depth at the finest scale, relative."""

@@ -11,6 +11,7 @@ from bathyscope_train.systems.endodav.network import EndoDav
 from bathyscope_train.systems.endodav.settings import EndoDavSettings
 from bathyscope_train.systems.kinds import bare
 from bathyscope_train.systems.loading import load_exactly
+from bathyscope_train.systems.vda.network import VideoDepthAnything
 from bathyscope_train.systems.vda.settings import SIZES
 
 _TEMPORAL = "head.motion_modules.0.temporal_transformer.transformer_blocks.0.ff.net.2.lora_A"
@@ -27,6 +28,20 @@ def load_endodav(path: Path) -> EndoDav:
     network = EndoDav(settings)
     load_exactly(network, weights, f"EndoDAV with {describe(settings)}")
     return network.eval()
+
+
+def start_from_vda(network: EndoDav, path: Path) -> None:
+    """Give a fresh network what its training begins with: the weights of Video Depth Anything, in the plain parts.
+
+    Adapters, necks and sigmoid output layers keep their start, in which adapters and necks change nothing.
+
+    Raises:
+        CheckpointError: If the file does not hold exactly Video Depth Anything in the network's size.
+    """
+    plain = VideoDepthAnything(network.settings.network)
+    load_exactly(plain, open_weights(path), f"Video Depth Anything of width {network.settings.network.width}")
+    _, unknown = network.load_state_dict(plain.state_dict(), strict=False)
+    assert all(".output_conv" in name for name in unknown), unknown
 
 
 def settings_of(weights: WeightFile) -> EndoDavSettings:

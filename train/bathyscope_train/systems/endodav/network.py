@@ -11,6 +11,7 @@ from bathyscope_train.systems.depth_anything.encoder import Encoder
 from bathyscope_train.systems.depth_anything.neck import add_necks
 from bathyscope_train.systems.endodav.head import HalvedVideoHead, SigmoidVideoHead
 from bathyscope_train.systems.endodav.settings import EndoDavSettings
+from bathyscope_train.systems.vda.head import through_time
 from bathyscope_train.systems.vda.network import normalised
 
 TEMPORAL_LINEARS = ("ff.net.2",)
@@ -55,10 +56,25 @@ class EndoDav(nn.Module):
         Raises:
             GeometryError: If a clip is longer than the temporal position table (32 frames).
         """
-        frames = resize_bilinear(clips.flatten(0, 1), self.settings.image_size)
-        taps = self.pretrained(normalised(frames))
+        taps = self._taps(clips.flatten(0, 1))
         disparities: tuple[Tensor, ...] = self.head.window(taps, self.settings.token_grid, clips.shape[1])
         return disparities
+
+    def mixed(self, frames: Float[Tensor, "t 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
+        """First stage of an exported network: all that :meth:`finish` reads of the frames of one window."""
+        levels = self.head.levels(self._taps(frames), self.settings.token_grid)
+        path3, _ = self.head.coarse(levels, through_time(self.head.motion_modules, frames.shape[0]))
+        return path3, levels[1], levels[0]
+
+    def finish(self, path3: Tensor, level2: Tensor, level1: Tensor) -> Float[Tensor, "n h2 w2"]:
+        """Second stage, which takes most memory and may run in chunks of frames: disparity of the finest scale."""
+        if isinstance(self.head, HalvedVideoHead):
+            return self.head.finish(path3, level2, level1, self.settings.image_size)
+        return self.head.finish(path3, level2, level1)
+
+    def _taps(self, frames: Float[Tensor, "n 3 h w"]) -> tuple[Tensor, ...]:
+        taps: tuple[Tensor, ...] = self.pretrained(normalised(resize_bilinear(frames, self.settings.image_size)))
+        return taps
 
     def disparity(self, clips: Float[Tensor, "b t 3 h w"]) -> Float[Tensor, "b t h2 w2"]:
         """Disparity of the finest scale."""
