@@ -51,7 +51,16 @@ class Prepared:
     new: int = 0
     """Files written in this run."""
     said: list[str] = field(default_factory=list)
-    """What is missing or was left out."""
+    """What is missing or was left out, and what to know."""
+
+    failed: bool = False
+    """Whether it could not be read to its end."""
+
+    @property
+    def complete(self) -> bool:
+        """Whether all published frames are there, each with a depth map."""
+        published = frame_counts().get(self.name)
+        return not self.failed if published is None else self.frames == self.depth == published
 
 
 def prepare_scared(
@@ -99,6 +108,7 @@ class _Work:
                 self._sequence(folder, entry)
         except DatasetError as error:
             entry.said.append(str(error))
+            entry.failed = True
         except OSError as error:
             raise DatasetError(f"{self.out}: cannot write ({error.strerror}); mend that and run again") from error
         return entry

@@ -46,8 +46,8 @@ def numbered_members(archive: Path, ending: str) -> Iterator[tuple[int, bytes]]:
 class TarDepth:
     """Depth straight from an archive, for frames that are asked for in its order.
 
-    An archive can only be read forwards. Going back begins again, which is allowed a few times, so that an evaluation
-    may look at a sequence twice.
+    An archive can only be read forwards. Going back reads it from its beginning: for another pass over the sequence
+    that is fine, for frames in any order it would take days, and is refused after a few times.
     """
 
     def __init__(self, archive: Path, code: DepthCode, size: Size, ending: str = ".tiff") -> None:
@@ -60,17 +60,17 @@ class TarDepth:
     def read(self, index: int) -> F32 | None:
         """True depth of a frame; ``None`` where the archive passes over its number."""
         if self._asked is None or index < self._asked:
-            self._begin_again()
+            self._begin_again(index)
         self._asked = index
         while self._held is not None and self._held[0] < index:
             self._advance()
         return self._decoded(*self._held) if self._held is not None and self._held[0] == index else None
 
-    def _begin_again(self) -> None:
+    def _begin_again(self, index: int) -> None:
         archive, _, _, ending = self._source
+        self._rewinds += index > 0
         if self._rewinds > _REWINDS:
             raise DatasetError(f"{archive}: frames are asked for in any order, an archive has one; {_ADVICE}")
-        self._rewinds += 1
         self._members, self._held = numbered_members(archive, ending), (-1, b"")
         self._advance()
 
