@@ -57,6 +57,14 @@ class WindowModel(Protocol):
         ...
 
 
+class VideoModel(Protocol):
+    """A video network, which sees a window of frames at once."""
+
+    def values(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> F32:
+        """Values (t, h, w), finite and never negative, of frames (t, 3, h', w') of RGB; see :class:`WindowModel`."""
+        ...
+
+
 @dataclass(frozen=True, slots=True)
 class ModelInMemory:
     """A scene network that runs in this process, with what a bundle's manifest would say of it."""

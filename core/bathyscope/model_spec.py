@@ -59,6 +59,12 @@ class ResizeSpec(_Strict):
         "pixels, 'centres' has the centre of the first pixel at (0.5, 0.5), as OpenCV has.",
     )
 
+    @model_validator(mode="after")
+    def _long_frames_are_measured_by_one_side(self) -> ResizeSpec:
+        if self.lower_long and self.least[0] != self.least[1]:
+            raise ValueError(f"lower_long lowers one shorter side; least must be a square, got {self.least}")
+        return self
+
 
 class VideoSpec(_Strict):
     """What a video network's values are, and how they are made."""

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from typing import cast
 
 import numpy as np
 
 from bathyscope.bundle import Bundle
 from bathyscope.clip import Clip
-from bathyscope.engines import DepthOptions, ModelInMemory, WindowModel
-from bathyscope.model_spec import InputSpec
+from bathyscope.engines import DepthOptions, ModelInMemory, VideoModel, WindowModel
+from bathyscope.errors import SettingsError
+from bathyscope.model_spec import InputSpec, ModelSpec
 from bathyscope.result import ClipDepth
 from bathyscope_serve.engine_settings import EngineSettings
-from bathyscope_serve.runtime import OnnxModel
+from bathyscope_serve.runtime import OnnxModel, OnnxVideoModel
 from bathyscope_serve.scene_session import SceneSession
 from bathyscope_serve.session import DepthSession, Job, Source
+from bathyscope_serve.video_session import VideoSession
 
 
 class DepthEngine:
@@ -23,10 +26,11 @@ class DepthEngine:
     Args:
         bundle: The model, on disk or in memory.
         settings: How it is run.
-        model: What to run instead of the bundle's own.
+        model: What to run instead of the bundle's own scene network.
 
     Raises:
         BundleError: If ONNX Runtime cannot load the bundle's graphs.
+        SettingsError: If the settings change the windows of a network that was trained to its own.
     """
 
     def __init__(
@@ -38,8 +42,8 @@ class DepthEngine:
     ) -> None:
         self.bundle = bundle
         self.settings = settings or EngineSettings()
-        self.model = model or (OnnxModel(bundle, self.settings) if isinstance(bundle, Bundle) else bundle.model)
-        self.input = _input(bundle.manifest.input, self.settings)
+        self.input = _input(bundle.manifest, self.settings)
+        self.model: WindowModel | VideoModel = model or _load(bundle, self.settings)
         self.renderers = ThreadPoolExecutor(self.settings.render_threads, thread_name_prefix="splat")
 
     def warm_up(self) -> None:
@@ -56,9 +60,10 @@ class DepthEngine:
             SettingsError: If the options ask for what the network does not have.
         """
         job = Job(source, options or DepthOptions(), name, self.bundle.id, self.settings, self.input)
-        scene = self.bundle.manifest.scene
-        assert scene is not None
-        return SceneSession(job, self.model, scene, self.renderers.map)
+        spec = self.bundle.manifest
+        if spec.scene is not None:
+            return SceneSession(job, cast(WindowModel, self.model), spec.scene, self.renderers.map)
+        return VideoSession(job, cast(VideoModel, self.model), spec)
 
     def depth_of(self, source: Source, options: DepthOptions | None = None, *, name: str | None = None) -> ClipDepth:
         """The whole result in memory: for short clips.
@@ -70,8 +75,16 @@ class DepthEngine:
         return ClipDepth.from_frames(list(session), session.meta())
 
 
-def _input(wanted: InputSpec, settings: EngineSettings) -> InputSpec:
-    """The bundle's input with what the settings say otherwise."""
-    changed = {"window": settings.window, "overlap": settings.overlap, "pixels": settings.pixels}
-    merged = wanted.model_dump() | {name: value for name, value in changed.items() if value is not None}
-    return InputSpec.model_validate(merged)
+def _load(bundle: Bundle | ModelInMemory, settings: EngineSettings) -> WindowModel | VideoModel:
+    if not isinstance(bundle, Bundle):
+        return bundle.model
+    return OnnxModel(bundle, settings) if bundle.manifest.kind == "scene" else OnnxVideoModel(bundle, settings)
+
+
+def _input(spec: ModelSpec, settings: EngineSettings) -> InputSpec:
+    """The network's input with what the settings say otherwise."""
+    wanted = {"window": settings.window, "overlap": settings.overlap, "pixels": settings.pixels}
+    changed = {name: value for name, value in wanted.items() if value is not None}
+    if changed and spec.kind == "video":
+        raise SettingsError(f"{spec.name} is a video network: {', '.join(changed)} cannot be changed")
+    return InputSpec.model_validate(spec.input.model_dump() | changed)

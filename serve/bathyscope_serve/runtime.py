@@ -20,8 +20,8 @@ F32 = NDArray[np.float32]
 Tensors = dict[str, NDArray[Any]]
 
 
-class OnnxModel:
-    """The three graphs of a bundle: backbone, heads in chunks of frames, cameras.
+class OnnxGraphs:
+    """The graphs of a bundle, loaded.
 
     Raises:
         BundleError: If ONNX Runtime cannot load a graph, or its inputs and outputs are not those of the manifest.
@@ -33,6 +33,43 @@ class OnnxModel:
         options = session_options(settings.threads)
         self._sessions = {role: _load(bundle, role, options) for role in bundle.manifest.graphs}
 
+    def run(self, role: Role, known: Tensors) -> Tensors:
+        """Outputs of a graph for what is known so far.
+
+        Raises:
+            BundleError: If the graph fails on this input.
+        """
+        graph = self._graph(role)
+        try:
+            values = self._sessions[role].run(list(graph.outputs), {name: known[name] for name in graph.inputs})
+        except Exception as error:  # ONNX Runtime raises classes of its own that share no base
+            raise BundleError(f"graph {graph.file} failed on {known['images'].shape} images: {error}") from error
+        return dict(zip(graph.outputs, values, strict=True))
+
+    def heads(self, known: Tensors, checkpoint: Callable[[], None]) -> Tensors:
+        """Dense heads, a few frames at a time: their activations are the other peak of memory."""
+        names = self._graph("heads").inputs
+        frames = len(known["images"])
+        parts: list[Tensors] = []
+        for start in range(0, frames, self._chunk):
+            checkpoint()
+            parts.append(self.run("heads", {name: known[name][start : start + self._chunk] for name in names}))
+        return {name: np.concatenate([part[name] for part in parts]) for name in self._graph("heads").outputs}
+
+    def _graph(self, role: Role) -> GraphSpec:
+        return self._manifest.graphs[role]
+
+
+class OnnxModel:
+    """A scene network: backbone, heads in chunks of frames, cameras.
+
+    Raises:
+        BundleError: See :class:`OnnxGraphs`.
+    """
+
+    def __init__(self, bundle: Bundle, settings: EngineSettings) -> None:
+        self._graphs = OnnxGraphs(bundle, settings)
+
     def predict(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> WindowMaps:
         """See :class:`~bathyscope.engines.WindowModel`.
 
@@ -41,11 +78,11 @@ class OnnxModel:
             BundleError: If a graph fails on this input.
         """
         known: Tensors = {"images": np.ascontiguousarray(images, np.float32)}
-        known |= self._run("backbone", known)
+        known |= self._graphs.run("backbone", known)
         checkpoint()
-        known |= self._heads(known, checkpoint)
+        known |= self._graphs.heads(known, checkpoint)
         checkpoint()
-        known |= self._run("cameras", known)
+        known |= self._graphs.run("cameras", known)
         t, h, w = len(images), *images.shape[2:]
         if known["depth"].shape != (t, h, w):
             raise GeometryError(f"the network's depth has shape {known['depth'].shape}, {(t, h, w)} was needed")
@@ -57,26 +94,34 @@ class OnnxModel:
             pose_encoding=np.asarray(known["pose_encoding"], np.float32),
         )
 
-    def _heads(self, known: Tensors, checkpoint: Callable[[], None]) -> Tensors:
-        """Dense heads, a few frames at a time: their activations are the other peak of memory."""
-        names = self._graph("heads").inputs
-        frames = len(known["images"])
-        parts: list[Tensors] = []
-        for start in range(0, frames, self._chunk):
-            checkpoint()
-            parts.append(self._run("heads", {name: known[name][start : start + self._chunk] for name in names}))
-        return {name: np.concatenate([part[name] for part in parts]) for name in self._graph("heads").outputs}
 
-    def _run(self, role: Role, known: Tensors) -> Tensors:
-        graph = self._graph(role)
-        try:
-            values = self._sessions[role].run(list(graph.outputs), {name: known[name] for name in graph.inputs})
-        except Exception as error:  # ONNX Runtime raises classes of its own that share no base
-            raise BundleError(f"graph {graph.file} failed on {known['images'].shape} images: {error}") from error
-        return dict(zip(graph.outputs, values, strict=True))
+class OnnxVideoModel:
+    """A video network: backbone on the whole window, heads in chunks of its frames.
 
-    def _graph(self, role: Role) -> GraphSpec:
-        return self._manifest.graphs[role]
+    Raises:
+        BundleError: See :class:`OnnxGraphs`.
+    """
+
+    def __init__(self, bundle: Bundle, settings: EngineSettings) -> None:
+        self._graphs = OnnxGraphs(bundle, settings)
+
+    def values(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> F32:
+        """See :class:`~bathyscope.engines.VideoModel`.
+
+        Raises:
+            GeometryError: If the values are not finite, negative, or not one map a frame.
+            BundleError: If a graph fails on this input.
+        """
+        known: Tensors = {"images": np.ascontiguousarray(images, np.float32)}
+        known |= self._graphs.run("backbone", known)
+        checkpoint()
+        values = np.asarray(self._graphs.heads(known, checkpoint)["values"], np.float32)
+        if values.ndim != 3 or len(values) != len(images):
+            raise GeometryError(f"the network gave values of shape {values.shape} for {len(images)} frames")
+        bad = int((~np.isfinite(values) | (values < 0)).sum())
+        if bad:
+            raise GeometryError(f"{bad} of the network's values are negative or not finite")
+        return values
 
 
 def session_options(threads: int | None) -> ort.SessionOptions:

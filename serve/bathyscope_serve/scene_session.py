@@ -9,7 +9,7 @@ import numpy as np
 from bathyscope.engines import WindowModel
 from bathyscope.errors import SettingsError
 from bathyscope.model_spec import SceneSpec
-from bathyscope.result import DepthKind, FrameDepth
+from bathyscope.result import DepthKind, FrameDepth, ResultMeta
 from bathyscope.vision.field_of_view import FieldOfView
 from bathyscope.vision.grid import Grid
 from bathyscope_serve.frames import FrameSource
@@ -33,7 +33,8 @@ class SceneSession(DepthSession):
     """
 
     def __init__(self, job: Job, model: WindowModel, scene: SceneSpec, renderers: Map) -> None:
-        super().__init__(job, _depth_kind(job, scene))
+        self._depth_kind = _depth_kind(job, scene)
+        super().__init__(job, ResultMeta(depth=self._depth_kind))
         self._model, self._scene, self._renderers = model, scene, renderers
 
     def _estimates(self, source: FrameSource, field_of_view: FieldOfView) -> Iterator[FrameDepth]:

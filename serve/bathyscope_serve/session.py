@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import Any, BinaryIO, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,7 @@ from bathyscope.clip import FrameSequence
 from bathyscope.engines import DepthOptions
 from bathyscope.errors import BathyscopeError
 from bathyscope.model_spec import InputSpec
-from bathyscope.result import BundleId, DepthKind, FrameDepth, ResultMeta
+from bathyscope.result import BundleId, FrameDepth, ResultMeta
 from bathyscope.vision.cuts import CutDetector
 from bathyscope.vision.field_of_view import FieldOfView, Mask, find_field_of_view
 from bathyscope_serve.engine_settings import EngineSettings
@@ -40,7 +40,7 @@ class SmallFrame:
     index: int
     timestamp_s: float
     image: NDArray[np.float32]
-    """(3, h, w) RGB in [0, 1]."""
+    """(3, h, w) RGB in [0, 1], or a little beyond where it was resized bicubically."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +56,15 @@ class Job:
 
 
 class DepthSession(ABC):
-    """One clip on its way through an engine; see :class:`bathyscope.engines.DepthRun`."""
+    """One clip on its way through an engine; see :class:`bathyscope.engines.DepthRun`.
 
-    def __init__(self, job: Job, depth: DepthKind) -> None:
-        self._job, self._depth_kind, self._name = job, depth, job.name
+    Args:
+        job: What to work on.
+        meaning: What the frames hold and what their numbers mean; the rest of it is filled in here.
+    """
+
+    def __init__(self, job: Job, meaning: ResultMeta) -> None:
+        self._job, self._meaning, self._name = job, meaning, job.name
         self._closed = False
         self._timings: dict[str, float] = {}
         self._complete, self._warnings = True, list[str]()
@@ -86,20 +91,20 @@ class DepthSession(ABC):
 
     def meta(self) -> ResultMeta:
         """What the frames mean: known after the last one."""
-        return ResultMeta(
-            name=self._name or "clip",
-            depth=self._depth_kind,
-            bundle=self._job.bundle,
-            software=f"bathyscope {version('bathyscope')}",
-            complete=self._complete,
-            warnings=tuple(self._warnings),
-            settings={
+        known: dict[str, Any] = {
+            "name": self._name or "clip",
+            "bundle": self._job.bundle,
+            "software": f"bathyscope {version('bathyscope')}",
+            "complete": self._complete,
+            "warnings": tuple(self._warnings),
+            "settings": {
                 "options": self._job.options.model_dump(),
                 "engine": self._job.settings.model_dump(),
                 "input": self._job.input.model_dump(),
             },
-            timings_s={name: round(seconds, 4) for name, seconds in self._timings.items()},
-        )
+            "timings_s": {name: round(seconds, 4) for name, seconds in self._timings.items()},
+        }
+        return self._meaning.model_copy(update=known)
 
     def close(self) -> None:
         """Stop the work at its next checkpoint; safe from another thread, and to call twice."""
@@ -133,7 +138,7 @@ class DepthSession(ABC):
                 if frame is None:
                     return
                 small = SmallFrame(frame.index, frame.timestamp_s, prepare(frame.image))
-                cut = cuts.is_cut(small.image)
+                cut = cuts.is_cut(np.clip(small.image, 0, 1))  # bicubic resizing overshoots
             self._checkpoint()
             yield small, cut
 

@@ -88,3 +88,33 @@ def write_bundle(folder: Path, *, poisoned: bool = False, renamed: bool = False)
     }
     write_manifest(folder, BundleManifest.model_validate(manifest))
     return Bundle.open(folder)
+
+
+def write_video_bundle(folder: Path, video: dict[str, Any], window: int = 1, overlap: int = 0) -> Bundle:
+    """values = mean colour of each pixel, or 0 if that is more: the backbone gives that mean, the heads hand it on."""
+    folder.mkdir(parents=True, exist_ok=True)
+    mean = helper.make_node("ReduceMean", ["images", "axes"], ["grey"], keepdims=1)
+    graph(folder / "backbone.onnx", [constant("axes", [1], 7), mean], {"images": IMAGES}, {"grey": MAPS})
+    heads = [constant("axes", [1], 7), helper.make_node("Squeeze", ["grey", "axes"], ["flat"])]
+    heads.append(helper.make_node("Relu", ["flat"], ["values"]))
+    graph(folder / "heads.onnx", heads, {"grey": MAPS}, {"values": ["t", "h", "w"]})
+    (folder / "weights.bin").write_bytes(b"")
+    names = ("backbone.onnx", "heads.onnx", "weights.bin")
+    manifest = {
+        "name": "made video",
+        "version": "1",
+        "preset": "made",
+        "kind": "video",
+        "graphs": {
+            "backbone": {"file": "backbone.onnx", "inputs": ["images"], "outputs": ["grey"]},
+            "heads": {"file": "heads.onnx", "inputs": ["grey"], "outputs": ["values"]},
+        },
+        "weights": "weights.bin",
+        "files": {name: hash_file(folder / name).model_dump() for name in names},
+        "input": {"patch": 14, "pixels": 28 * 42, "window": window, "overlap": overlap},
+        "video": video,
+        "licence": "Apache-2.0",
+        "research_only": False,
+    }
+    write_manifest(folder, BundleManifest.model_validate(manifest))
+    return Bundle.open(folder)
