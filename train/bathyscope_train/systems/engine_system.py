@@ -14,6 +14,7 @@ from bathyscope.camera import F64
 from bathyscope.clip import FrameSequence
 from bathyscope.engines import DepthOptions, Engine, engine_factory
 from bathyscope.errors import ClipError
+from bathyscope.model_spec import ModelSpec
 from bathyscope_train.systems.options import refuse_options
 from bathyscope_train.systems.system import FrameEstimate, SystemInfo, SystemOptions
 
@@ -39,17 +40,7 @@ class EngineSystem:
         manifest = bundle.manifest
         name = label or f"{manifest.name} {manifest.version}"
         refuse_options(name, options, takes=("depth",))
-        info = SystemInfo(
-            name=name,
-            quantity="depth",
-            scale="relative",
-            confidence=True,
-            cameras=True,
-            weights_sha256=bundle.digest,
-            licence=manifest.licence,
-            details={"depth": options.depth, **manifest.input.model_dump()},
-        )
-        return cls(engine_factory()(bundle), info, options)
+        return cls(engine_factory()(bundle), describe(manifest, name, bundle.digest, options), options)
 
     def estimate(self, frames: FrameSequence, intrinsics: F64 | None = None) -> Iterator[FrameEstimate]:
         """See :class:`~bathyscope_train.systems.system.System`.
@@ -65,7 +56,7 @@ class EngineSystem:
                     index=frame.index,
                     values=np.asarray(frame.depth, np.float32),
                     valid=frame.valid,
-                    confidence=np.asarray(frame.confidence, np.float32),
+                    confidence=None if frame.confidence is None else np.asarray(frame.confidence, np.float32),
                     world_from_camera=frame.world_from_camera,
                     intrinsics=frame.intrinsics,
                     segment=frame.segment,
@@ -76,3 +67,20 @@ class EngineSystem:
             _log.warning("%s, %s: %s", self.info.name, frames.name, warning)
         if count != len(frames):
             raise ClipError(f"{frames.name}: {len(frames)} frames went in, {count} came back: {'; '.join(warnings)}")
+
+
+def describe(spec: ModelSpec, name: str, digest: str, options: SystemOptions) -> SystemInfo:
+    """What a network that the engine runs is, as results of the engine hold its values."""
+    video = spec.video
+    rendered = spec.scene is not None and spec.scene.gaussians
+    return SystemInfo(
+        name=name,
+        quantity="depth" if video is None else video.quantity,
+        scale="relative" if video is None else video.scale,
+        unit="mm" if video is not None and video.scale == "metric" else None,
+        confidence="confidence" in spec.outputs,
+        cameras="cameras" in spec.outputs,
+        weights_sha256=digest,
+        licence=spec.licence,
+        details={"depth": options.depth if rendered else "head", **spec.input.model_dump()},
+    )

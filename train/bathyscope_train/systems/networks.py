@@ -21,9 +21,9 @@ from bathyscope_train.model.checkpoints import load_network
 from bathyscope_train.model.network import Features, Network
 from bathyscope_train.model.presets import get_preset
 from bathyscope_train.model.specs import network_spec
-from bathyscope_train.systems.engine_system import EngineSystem
+from bathyscope_train.systems.engine_system import EngineSystem, describe
 from bathyscope_train.systems.options import refuse_options
-from bathyscope_train.systems.system import F32, SystemInfo, SystemOptions
+from bathyscope_train.systems.system import F32, SystemOptions
 
 _SIDES = {"vit": 448, "conv": 125}
 """Root of the area that a network is fed, by the kind of its stem: as AnySplat was trained, and as ours was."""
@@ -67,18 +67,8 @@ def network_system(network: Network, path: Path, name: str, options: SystemOptio
     digest = hash_file(path).sha256
     wanted = _input(network, options)
     spec = network_spec(preset, name=name, version=digest[:12], wanted=wanted, licence="as its weights")
-    depth = options.depth if preset.gaussians is not None else "head"
-    info = SystemInfo(
-        name=name,
-        quantity="depth",
-        scale="relative",
-        confidence=True,
-        cameras=True,
-        weights_sha256=digest,
-        details={"depth": depth, **wanted.model_dump()},
-    )
     model = ModelInMemory(spec, digest, TorchModel(network.to(options.device)))
-    return EngineSystem(engine_factory()(model), info, options.model_copy(update={"depth": depth}))
+    return EngineSystem(engine_factory()(model), describe(spec, name, digest, options), options)
 
 
 @dataclass(frozen=True)
