@@ -297,3 +297,10 @@ def test_windows_are_made_of_whole_patches() -> None:
 def test_worker_processes_and_readers_do_not_load_torch() -> None:
     code = "import sys, bathyscope_train.data.clip_workers; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_videos_beside_folders_of_our_own_are_used_too(tmp_path: Path) -> None:
+    own_folder(tmp_path / "own", [3 * k for k in range(6)])
+    write_frames(tmp_path / "other" / "clip", pan([3 * k for k in range(6)]))
+    write_video(tmp_path / "one.mp4", pan([2 * k for k in range(6)]))
+    assert [s.name for s in open_sources([ClipSource(folder=tmp_path)]).sequences] == ["own", "one.mp4", "clip"]

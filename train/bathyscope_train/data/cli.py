@@ -97,7 +97,7 @@ def _print_report(report: Any) -> None:
     for heading in ("sequence", "frames", "size", "depth coverage", "poses"):
         table.add_column(heading, justify="left" if heading == "sequence" else "right")
     for s in report.sequences:
-        coverage = "-" if s.depth_coverage is None else f"{s.depth_coverage:.0%}"
+        coverage = "-" if s.depth_coverage is None else f"{s.depth_coverage:.1%}"
         table.add_row(s.name, str(s.frames), f"{s.size[1]}x{s.size[0]}", coverage, str(s.poses))
     console.print(table)
     for level in ("missing", "unreadable", "pitfall", "note"):

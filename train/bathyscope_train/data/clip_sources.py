@@ -13,13 +13,10 @@ from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat
 from bathyscope.errors import DatasetError
 from bathyscope_train.data.clip_windows import ClipWindows, WindowSettings
 from bathyscope_train.data.datasets.catalogue import KINDS, DataSetKind, recognise
-from bathyscope_train.data.datasets.frame_files import ImageFiles, image_size
+from bathyscope_train.data.datasets.frame_videos import is_video
+from bathyscope_train.data.datasets.own_folder import open_own_folder, own_folders
 from bathyscope_train.data.datasets.sequence import DataSequence
 from bathyscope_train.data.datasets.videos import open_videos
-from bathyscope_train.evaluation.calibration import read_calibration
-from bathyscope_train.evaluation.folder_sequences import known_unit
-from bathyscope_train.evaluation.folders import read_mask, read_poses
-from bathyscope_train.evaluation.images import image_files
 
 TRAINING_SPLITS = {"scared": "video-train", "simcol": "train"}
 """What is trained on where no split is named: never what the field tests on."""
@@ -90,44 +87,15 @@ def open_sources(sources: Sequence[ClipSource]) -> OpenedSources:
     return OpenedSources(tuple(sequences), tuple(shares), tuple(notes))
 
 
-def open_own_folder(path: Path) -> DataSequence:
-    """A folder in our own layout, with or without true depth; calibration, poses and mask where they are there.
-
-    Raises:
-        DatasetError: If it has no frames, or a file that is there cannot be used.
-    """
-    files = image_files(path / "frames")
-    if not files:
-        raise DatasetError(f"{path / 'frames'}: no .jpg or .png frames; a data set folder holds them there")
-    stated = path / "intrinsics.json"
-    calibration = read_calibration(stated) if stated.is_file() else None
-    size = image_size(files[0]) if calibration is None else calibration.size
-    table = path / "poses.txt"
-    poses = read_poses(table, files) if table.is_file() else None
-    mask = read_mask(path / "mask.png", size) if (path / "mask.png").is_file() else None
-    return DataSequence(
-        name=path.resolve().name,
-        frames=ImageFiles(files),
-        frame_names=[file.stem for file in files],
-        size=size,
-        intrinsics=None if calibration is None else calibration.matrix,
-        world_from_camera=poses,
-        pose_unit=None if poses is None or calibration is None else known_unit(calibration.pose_unit),
-        inside=mask,
-    )
-
-
 def _open(source: ClipSource) -> tuple[list[DataSequence], list[str]]:
     root = source.folder
     if root.is_file():
         return _any_videos(source)
     kind = recognise(root)
-    if kind is None and (root / "frames").is_dir():
-        return [open_own_folder(root)], []
     if kind is None:
         return _any_videos(source)
     if kind.name == "folders":
-        return _own_folders(root)
+        return _own_folders(source)
     return _data_set(kind, source)
 
 
@@ -136,15 +104,26 @@ def _any_videos(source: ClipSource) -> tuple[list[DataSequence], list[str]]:
     return list(found.sequences), [gap.reason for gap in found.gaps]
 
 
-def _own_folders(root: Path) -> tuple[list[DataSequence], list[str]]:
-    if (root / "frames").is_dir():
-        return [open_own_folder(root)], []
-    sequences, notes = [], []
-    for path in sorted(path.parent for path in root.glob("*/intrinsics.json")):
+def _own_folders(source: ClipSource) -> tuple[list[DataSequence], list[str]]:
+    """Folders in our own layout, and whatever else lies beside them."""
+    root = source.folder
+    paths = own_folders(root)
+    sequences: list[DataSequence] = []
+    notes: list[str] = []
+    for path in paths:
         try:
             sequences.append(open_own_folder(path))
         except DatasetError as error:
             notes.append(str(error))
+    for path in sorted(root.iterdir() if root not in paths else ()):
+        if path not in paths and (is_video(path) or (path.is_dir() and not path.name.startswith("."))):
+            try:
+                found, said = _any_videos(source.model_copy(update={"folder": path}))
+            except DatasetError as error:
+                notes.append(str(error))
+            else:
+                sequences += found
+                notes += said
     if not sequences:
         raise DatasetError(f"{root}: nothing to train on: {'; '.join(notes)}")
     return sequences, notes

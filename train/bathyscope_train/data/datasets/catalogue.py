@@ -10,6 +10,7 @@ from bathyscope.errors import DatasetError
 from bathyscope_train.data.datasets.c3vd import is_c3vd, open_c3vd
 from bathyscope_train.data.datasets.endoslam import is_endoslam, open_endoslam
 from bathyscope_train.data.datasets.hamlyn import hamlyn_splits, is_hamlyn, open_hamlyn
+from bathyscope_train.data.datasets.own_folder import own_folders
 from bathyscope_train.data.datasets.scared import FrameChoice, open_scared
 from bathyscope_train.data.datasets.scared_splits import scared_splits
 from bathyscope_train.data.datasets.scared_tree import is_scared
@@ -30,10 +31,6 @@ class DataSetKind:
     open: Callable[[Path, str, FrameChoice, Path | None], EvaluationSet]
 
 
-def _is_own_layout(root: Path) -> bool:
-    return (root / "intrinsics.json").is_file() or next(root.glob("*/intrinsics.json"), None) is not None
-
-
 _VIDEO_TEST = "video-test"
 KINDS: Mapping[str, DataSetKind] = {
     kind.name: kind
@@ -48,7 +45,12 @@ KINDS: Mapping[str, DataSetKind] = {
         DataSetKind("c3vd", (), is_c3vd, lambda root, *_: open_c3vd(root)),
         DataSetKind("simcol", ("test", "train", "all"), is_simcol, lambda root, split, *_: open_simcol(root, split)),
         DataSetKind("endoslam", (), is_endoslam, lambda root, *_: open_endoslam(root)),
-        DataSetKind("folders", (), _is_own_layout, lambda root, *_: open_folders(root.resolve().name, root)),
+        DataSetKind(
+            "folders",
+            (),
+            lambda root: bool(own_folders(root)),
+            lambda root, *_: open_folders(root.resolve().name, root),
+        ),
     )
 }
 """In the order in which a folder is tried."""

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from bathyscope.errors import DatasetError
 from bathyscope_train.data.clip_survey import survey_clips
 from bathyscope_train.data.datasets.catalogue import KINDS, recognise
+from bathyscope_train.data.datasets.own_folder import open_own_folder, own_folders
 from bathyscope_train.data.datasets.pitfalls import pitfalls
 from bathyscope_train.data.datasets.pose_agreement import pose_agreement
 from bathyscope_train.data.datasets.scared import open_keyframe, open_sequence, published_shortfall
@@ -20,6 +21,8 @@ from bathyscope_train.data.datasets.scared_tree import find_scared
 from bathyscope_train.data.datasets.sequence import DataSequence
 from bathyscope_train.data.datasets.tar_members import TarDepth
 from bathyscope_train.data.datasets.videos import open_videos
+from bathyscope_train.evaluation.folder_sequences import FolderSequence
+from bathyscope_train.evaluation.folders import DatasetFolder
 from bathyscope_train.evaluation.sequences import EvaluationSequence
 
 Level = Literal["missing", "unreadable", "pitfall", "note"]
@@ -105,10 +108,30 @@ def _recognised(root: Path) -> str:
 def _open(root: Path, name: str) -> tuple[list[EvaluationSequence], list[Finding]]:
     if name == "scared":
         return _open_scared(root)
+    if name == "folders":
+        return _open_folders(root)
     kind = KINDS[name]
     opened = kind.open(root, "all" if "all" in kind.splits else "", "all", None)
     gaps = [Finding(level="missing", where=f"{g.sequence} {g.what}".strip(), what=g.reason) for g in opened.gaps]
     return list(opened.sequences), gaps
+
+
+def _open_folders(root: Path) -> tuple[list[EvaluationSequence], list[Finding]]:
+    """Folders in our own layout; those without true depth can be trained on."""
+    sequences: list[EvaluationSequence] = []
+    findings: list[Finding] = []
+    for path in own_folders(root):
+        try:
+            sequences.append(FolderSequence(DatasetFolder.open(path), path.resolve().name))
+        except DatasetError as error:
+            findings.append(Finding(level="missing", where=path.resolve().name, what=str(error)))
+            try:
+                sequences.append(open_own_folder(path))
+            except DatasetError as problem:
+                findings.append(Finding(level="unreadable", where=path.resolve().name, what=str(problem)))
+    if not sequences:
+        raise DatasetError(f"{root}: no folder can be used: {'; '.join(finding.what for finding in findings)}")
+    return sequences, findings
 
 
 def _open_scared(root: Path) -> tuple[list[EvaluationSequence], list[Finding]]:
@@ -191,8 +214,6 @@ def _look(sequence: EvaluationSequence, index: int) -> Iterator[tuple[str | None
 
 
 def _poses_and_depth(sequence: EvaluationSequence) -> list[Finding]:
-    if not isinstance(sequence, DataSequence):
-        return []
     try:
         agreement = pose_agreement(sequence)
     except DatasetError as error:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bathyscope.camera import F64, invert_pose, project, unproject
-from bathyscope_train.data.datasets.sequence import DataSequence
-from bathyscope_train.evaluation.sequences import F32, MILLIMETRES
+from bathyscope_train.evaluation.sequences import F32, MILLIMETRES, EvaluationSequence
 
 _LEAST_PIXELS = 50
 _TELLING = 0.02
@@ -37,14 +36,16 @@ class PoseAgreement:
         return self.tells and self.turned_round < 0.5 * self.as_read
 
     def __str__(self) -> str:
+        others = (self.turned_round, self.standing_still)
+        turned, still = (f"{value:.1%}" if np.isfinite(value) else "out of the picture" for value in others)
         words = (
             f"depth carried from frame {self.frames[0]} to {self.frames[1]} differs by {self.as_read:.1%} "
-            f"(poses turned round: {self.turned_round:.1%}, camera standing still: {self.standing_still:.1%})"
+            f"(poses turned round: {turned}, camera standing still: {still})"
         )
         return words if self.tells else f"{words}; too little motion to tell the direction"
 
 
-def pose_agreement(sequence: DataSequence, *, reach: int = 40) -> PoseAgreement | None:
+def pose_agreement(sequence: EvaluationSequence, *, reach: int = 40) -> PoseAgreement | None:
     """Measure the first frame with depth against the one of the next ``reach`` whose camera is farthest from it.
 
     ``None`` where poses, depth or intrinsics are missing, or no pixel can be compared.
@@ -68,7 +69,7 @@ def pose_agreement(sequence: DataSequence, *, reach: int = 40) -> PoseAgreement 
     return PoseAgreement((first, second), *(np.inf if value is None else value for value in found))
 
 
-def _pair(sequence: DataSequence, reach: int) -> tuple[tuple[int, F32], tuple[int, F32], float] | None:
+def _pair(sequence: EvaluationSequence, reach: int) -> tuple[tuple[int, F32], tuple[int, F32], float] | None:
     poses = sequence.world_from_camera
     if poses is None or sequence.pose_unit is None:
         return None
@@ -84,7 +85,7 @@ def _pair(sequence: DataSequence, reach: int) -> tuple[tuple[int, F32], tuple[in
     return None
 
 
-def _factor(sequence: DataSequence) -> float:
+def _factor(sequence: EvaluationSequence) -> float:
     """Units of depth in one unit of the poses."""
     unit = sequence.pose_unit
     if unit is None or unit not in MILLIMETRES or sequence.depth_unit not in MILLIMETRES:
