@@ -88,6 +88,7 @@ def _dynamic_shapes(stage: Stage, patch: int) -> tuple[Any, ...]:
         "images": {0: frames, 2: height, 3: width},
         "depth": {0: frames, 1: height, 2: width},
         "camera": {0: frames},
+        "focal": {},
     }
     kinds = {"tokens": {0: frames, 1: rows, 2: columns}, "stem": {0: frames, 2: Dim.DYNAMIC, 3: Dim.DYNAMIC}}
     shapes = [known[name] if name in known else kinds[name.split("_")[0]] for name in stage.inputs]
@@ -99,7 +100,9 @@ def _dynamic_shapes(stage: Stage, patch: int) -> tuple[Any, ...]:
 def axes(name: str) -> tuple[str, ...]:
     """Names of the axes of an input or output; a name that is a number of channels is left as it is."""
     kind, _, index = name.partition("_")
-    if name in ("depth", "confidence"):
+    if name == "focal":
+        return ("",)
+    if name in ("depth", "confidence", "refined_depth"):
         return ("frames", "height", "width")
     if name in ("images", "gaussians"):
         return ("frames", "", "height", "width")

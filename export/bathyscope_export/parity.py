@@ -103,7 +103,7 @@ def run_graphs(
     sessions: Mapping[Role, ort.InferenceSession], graphs: Mapping[Role, GraphSpec], images: NDArray[np.float32]
 ) -> dict[str, NDArray[np.float32]]:
     """Everything that the graphs say about frames (t, 3, h, w), by name."""
-    known = {"images": images}
+    known = {"images": images, "focal": np.zeros(1, np.float32)}
     order: tuple[Role, ...] = ("backbone", "heads", "cameras")
     for role in order:
         graph = graphs[role]
@@ -135,7 +135,7 @@ def _difference(expected: Prediction, observed: Mapping[str, NDArray[np.float32]
         frames=maps.depth.shape[1],
         height=size[0],
         width=size[1],
-        depth=_spread(maps.depth[0], observed["depth"]),
+        depth=_spread(maps.depth[0], observed.get("refined_depth", observed["depth"])),
         confidence=_spread(maps.confidence[0], observed["confidence"]),
         gaussians=max(
             _spread(maps.gaussians[0, :, channel], observed["gaussians"][:, channel])

@@ -68,9 +68,9 @@ def _camera_stage(network: Network, named: Mapping[str, Tensor], depth: Tensor) 
     return Stage(
         "cameras",
         MatchingCameras(network, halvings=1 + int(stem.removeprefix("stem_"))),
-        (depth, *(named[name] for name in ("camera", tokens, stem))),
-        ("depth", "camera", tokens, stem),
-        ("pose_encoding",),
+        (depth, *(named[name] for name in ("camera", tokens, stem)), torch.zeros(1)),
+        ("depth", "camera", tokens, stem, "focal"),
+        ("pose_encoding", "refined_depth"),
     )
 
 
@@ -119,11 +119,13 @@ class TokenCameras(nn.Module):
 
     def forward(self, camera: Tensor) -> Tensor:
         known = Features(taps=(), camera=camera[None])
-        return self.network.cameras(known, camera.new_ones(()))[0]
+        return self.network.cameras(known, camera.new_ones(())).pose_encodings[-1, 0]
 
 
 class MatchingCameras(nn.Module):
-    """Depth, camera tokens, the last tokens and the last stem map to pose encodings (t, 9), for the matching head.
+    """Depth, camera tokens, the last tokens and the last stem map to pose encodings (t, 9) and refined depth (t, h, w).
+
+    For the matching head. ``focal`` (1,) is the focal length in pixels where it is known, else 0.
 
     Args:
         network: The network.
@@ -135,13 +137,16 @@ class MatchingCameras(nn.Module):
         self.network = network
         self.halvings = halvings
 
-    def forward(self, depth: Tensor, camera: Tensor, tokens: Tensor, stem: Tensor) -> Tensor:
+    def forward(
+        self, depth: Tensor, camera: Tensor, tokens: Tensor, stem: Tensor, focal: Tensor
+    ) -> tuple[Tensor, Tensor]:
         known = Features(
             taps=(tokens.flatten(1, 2)[None],),
             camera=camera[None],
             stem_maps=(_cut(stem, depth.shape[-2:], halvings=self.halvings),),
         )
-        return self.network.cameras(known, depth[None])[0]
+        solved = self.network.cameras(known, depth[None], focal)
+        return solved.pose_encodings[-1, 0], solved.depth[0]
 
 
 def _cut(maps: Tensor, size: Sequence[int], *, halvings: int) -> Tensor:

@@ -16,8 +16,9 @@ import torch
 from onnx import TensorProto, helper
 from typer.testing import CliRunner
 
-from bathyscope.bundle import Bundle, InputSpec, Role
+from bathyscope.bundle import Bundle, Role
 from bathyscope.errors import BundleError, CheckpointError
+from bathyscope.model_spec import InputSpec
 from bathyscope_export.attention import check_linear_attention, fused_count
 from bathyscope_export.cli import app
 from bathyscope_export.graph import export_stage
@@ -210,6 +211,7 @@ def test_cameras_solved_from_matches_export_too(tmp_path: Path) -> None:
         "camera": preset.camera.model_copy(update={"rounds": 1, "iterations": 1}),
     }
     network = Network(preset.model_copy(update=small)).eval()
+    torch.nn.init.normal_(network.camera_head.refiner.readout.weight, std=0.05)
     backbone, _, cameras = split(network)
     model = export_stage(cameras, patch=14)
     externalise([model], tmp_path / "weights.bin")
@@ -218,18 +220,21 @@ def test_cameras_solved_from_matches_export_too(tmp_path: Path) -> None:
     assert (
         [value.name for value in session.get_inputs()]
         == list(cameras.inputs)
-        == ["depth", "camera", "tokens_0", "stem_1"]
+        == ["depth", "camera", "tokens_0", "stem_1", "focal"]
     )
-    for frames, height, width in ((1, 56, 70), (6, 84, 56)):
+    for frames, height, width, focal in ((1, 56, 70, 0.0), (6, 84, 56, 0.0), (6, 84, 56, 70.0)):
         images = sample_clip(frames, height, width)
         with torch.no_grad():
             known = dict(zip(backbone.outputs, backbone.module(images), strict=True))
-            known["depth"] = 1 + images.mean(1)
-            expected = cameras.module(*(known[name] for name in cameras.inputs)).numpy()
-        (observed,) = session.run(None, {name: known[name].numpy() for name in cameras.inputs})
-        assert frames == 1 or np.abs(expected[1:, :3]).max() > 1e-3
+            known |= {"depth": 1 + images.mean(1), "focal": torch.tensor([focal])}
+            expected = [each.numpy() for each in cameras.module(*(known[name] for name in cameras.inputs))]
+        observed = session.run(None, {name: known[name].numpy() for name in cameras.inputs})
+        assert frames == 1 or np.abs(expected[0][1:, :3]).max() > 1e-3
         # Matches of an untrained network contradict each other, and the solver amplifies rounding.
-        np.testing.assert_allclose(observed, expected, atol=5e-5)
+        np.testing.assert_allclose(observed[0], expected[0], atol=5e-5)
+        np.testing.assert_allclose(observed[1], expected[1], atol=5e-5)
+        if focal:
+            np.testing.assert_allclose(observed[0][:, 7], 2 * np.arctan(height / 2 / focal), atol=1e-5)
 
 
 def test_a_difference_beyond_rounding_stops_the_export() -> None:

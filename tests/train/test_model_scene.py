@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bathyscope.bundle import SceneSpec
 from bathyscope.errors import GeometryError
+from bathyscope.model_spec import SceneSpec
 from bathyscope.scene import WindowMaps
 from bathyscope.scene import assemble_scene as numpy_scene
 from bathyscope.splat import render
@@ -153,7 +154,7 @@ def test_a_network_without_gaussians_has_no_scene() -> None:
     prediction, images = random_prediction()
     maps = DenseMaps(prediction.maps.depth, prediction.maps.confidence, None)
     with pytest.raises(GeometryError, match="no Gaussian head"):
-        assemble_scene(Prediction(prediction.pose_encodings, maps), images, FOOTPRINT)
+        assemble_scene(replace(prediction, maps=maps), images, FOOTPRINT)
 
 
 @given(seed=st.integers(0, 10_000), degree=st.integers(0, 4))

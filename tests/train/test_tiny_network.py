@@ -79,8 +79,25 @@ def test_lengths_of_the_cameras_follow_the_unit_of_the_depth(network: Network) -
     features = network.encode(images)
     depth = network.dense(features, images).depth
     small, large = network.cameras(features, depth), network.cameras(features, 10 * depth)
-    torch.testing.assert_close(large[..., :3], 10 * small[..., :3], atol=1e-4, rtol=1e-3)
-    torch.testing.assert_close(large[..., 3:], small[..., 3:], atol=1e-4, rtol=1e-3)
+    one, ten = small.pose_encodings[-1], large.pose_encodings[-1]
+    torch.testing.assert_close(ten[..., :3], 10 * one[..., :3], atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(ten[..., 3:], one[..., 3:], atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(large.depth, 10 * small.depth, atol=1e-4, rtol=1e-3)
+
+
+@torch.no_grad()
+def test_a_known_focal_length_is_kept_and_zero_means_unknown(network: Network) -> None:
+    images = clip(4).repeat(2, 1, 1, 1, 1)
+    known = decode_cameras(network(images, torch.tensor([0.0, 61.0])).pose_encoding, (56, 70)).intrinsics
+    free = decode_cameras(network(images).pose_encoding, (56, 70)).intrinsics
+    torch.testing.assert_close(known[1, :, 0, 0], torch.full((4,), 61.0), atol=1e-3, rtol=0)
+    torch.testing.assert_close(known[0], free[0])
+
+
+@torch.no_grad()
+def test_depth_is_not_corrected_before_anything_was_learnt(network: Network) -> None:
+    prediction = network(clip(5))
+    torch.testing.assert_close(prediction.maps.depth, prediction.single_view_depth)
 
 
 def test_every_parameter_learns() -> None:
@@ -88,9 +105,10 @@ def test_every_parameter_learns() -> None:
     torch.manual_seed(0)
     network = Network(get_preset("tiny"))
     with torch.no_grad():
-        for readout in (network.depth_head.readout, network.gaussian_param_head.readout):
+        readouts = (network.depth_head, network.gaussian_param_head, network.camera_head.refiner)
+        for readout in (each.readout for each in readouts):
             readout.weight.normal_(std=0.1)
-    prediction = network(clip(3))
+    prediction = network(clip(6))
     total = prediction.maps.depth.mean() + prediction.maps.confidence.mean() + prediction.pose_encoding.square().sum()
     (total + prediction.maps.gaussians.square().mean()).backward()
     silent = [name for name, each in network.named_parameters() if each.grad is None or not each.grad.any()]

@@ -39,7 +39,7 @@ class PretrainSettings(BaseModel, frozen=True, extra="forbid"):
     )
     batch: PositiveInt = Field(default=2, description="Windows a step, over all workers.")
     frames: PositiveInt = Field(default=8, description="Frames of a window.")
-    pairs: PositiveInt = Field(default=10, description="Supervised motions a window.")
+    pairs: PositiveInt = Field(default=16, description="Supervised motions a window.")
     peak_lr: PositiveFloat = 1e-3
     warmup_steps: NonNegativeInt = 60
     true_focal_steps: NonNegativeInt = Field(

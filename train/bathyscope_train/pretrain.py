@@ -9,19 +9,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
 from torch import Tensor, nn
 
 from bathyscope.errors import SettingsError
 from bathyscope_train.config import PretrainSettings
 from bathyscope_train.data.truth_clips import read_truth_clips
 from bathyscope_train.data.windows import Batch, TruthClip, sample_window, stack
-from bathyscope_train.losses.supervised import supervised_objective
+from bathyscope_train.losses.supervised import SolverInput, supervised_objective
 from bathyscope_train.model.checkpoints import load_network, save_checkpoint
 from bathyscope_train.model.matching_camera_head import MatchingCameraHead
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import get_preset
-from bathyscope_train.model.trajectory import GAPS
+from bathyscope_train.model.trajectory import ClipPairs, clip_pairs
 from bathyscope_train.schedule import ema_decay, learning_rate_factor, source_shares
 from bathyscope_train.training_state import read_state, write_state
 from bathyscope_train.validation import Validation, validate, write_grid
@@ -30,6 +29,8 @@ from bathyscope_train.workers import average, launch, share_gradients
 LOG_STEPS = 10
 WEIGHTS_FILE = "model.safetensors"
 METRICS_FILE = "metrics.jsonl"
+
+_FOCAL_ERROR = 0.15  # standard deviation of the logarithm
 
 _log = logging.getLogger(__name__)
 
@@ -100,18 +101,12 @@ class _Run:
         settings, step = self.settings, self.position.step
         random = np.random.default_rng([settings.seed, step, self.rank])
         batch = self.draw_batch(progress, random)
-        source, target = draw_pairs(settings.frames, settings.pairs, random)
-        true_focal = step < settings.true_focal_steps or random.random() < 0.5
+        pairs = draw_pairs(settings.frames, settings.pairs, random)
+        given = draw_solver_input(random, certain=step < settings.true_focal_steps)
         self.network.train()
         self.optimizer.zero_grad(set_to_none=True)
         objective = supervised_objective(
-            self.network,
-            batch,
-            source,
-            target,
-            settings.loss,
-            true_focal=bool(true_focal),
-            autocast=use_bfloat16(settings.precision),
+            self.network, batch, pairs, settings.loss, given, autocast=use_bfloat16(settings.precision)
         )
         objective.total.backward()
         self.position.step += 1
@@ -240,12 +235,19 @@ def parameter_groups(network: Network, settings: PretrainSettings) -> list[dict[
     ]
 
 
-def draw_pairs(frames: int, count: int, random: np.random.Generator) -> tuple[Int[Tensor, "p"], Int[Tensor, "p"]]:
+def draw_pairs(frames: int, count: int, random: np.random.Generator) -> ClipPairs:
     """Some of the pairs whose motions the trajectory uses, without repetition."""
-    every = [(k - gap, k) for gap in GAPS for k in range(gap, frames)]
-    chosen = random.permutation(len(every))[:count]
-    pairs = torch.tensor([every[int(index)] for index in chosen])
-    return pairs[:, 0], pairs[:, 1]
+    every = clip_pairs(frames)
+    usable = np.flatnonzero(every.inside.numpy())
+    chosen = torch.from_numpy(np.sort(random.permutation(usable)[:count]))
+    return ClipPairs(every.source[chosen], every.target[chosen], every.inside[chosen])
+
+
+def draw_solver_input(random: np.random.Generator, *, certain: bool) -> SolverInput:
+    """What the solver starts from: in half of the steps, and while ``certain``, the truth."""
+    focal, motion = random.random(2) < 0.5
+    error = float(np.exp(random.normal(0, _FOCAL_ERROR)))
+    return SolverInput(true_focal=bool(certain or focal), focal_error=error, true_motion=bool(certain or motion))
 
 
 def use_bfloat16(precision: str) -> bool:

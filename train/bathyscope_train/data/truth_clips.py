@@ -17,6 +17,8 @@ def truth_clip(clip: SyntheticClip) -> TruthClip:
         world_from_camera=torch.from_numpy(clip.world_from_camera).float(),
         focal=float(clip.intrinsics[0, 0]),
         name=clip.name,
+        moving=torch.from_numpy(clip.moving) if clip.moving.any() else None,
+        distortion=(clip.distortion.k1, clip.distortion.k2),
     )
 
 

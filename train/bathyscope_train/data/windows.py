@@ -1,7 +1,7 @@
 """Training windows: a few frames of a rendered clip with their truth, cut, flipped and recoloured at random."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -23,6 +23,10 @@ class TruthClip:
     focal: float
     """In pixels; square pixels, principal point at the centre of the image."""
     name: str
+    moving: Bool[Tensor, "t h w"] | None = None
+    """Pixels whose motion is not the camera's; None for nowhere."""
+    distortion: tuple[float, float] = (0.0, 0.0)
+    """Radial, of normalised coordinates: 1 + k1 r^2 + k2 r^4."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +38,10 @@ class Batch:
     valid: Bool[Tensor, "b t h w"]
     world_from_camera: Float[Tensor, "b t 4 4"]
     focal: Float[Tensor, "b"]
+    moving: Bool[Tensor, "b t h w"]
+    """Pixels whose motion is not the camera's."""
+    distortion: Float[Tensor, "b 2"]
+    """Radial distortion k1, k2 of the lens."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,6 +78,8 @@ def cut_window(clip: TruthClip, index: Sequence[int]) -> Batch:
             valid=valid[None],
             world_from_camera=(torch.linalg.inv(poses[0].double()) @ poses.double()).float()[None],
             focal=torch.tensor([clip.focal]),
+            moving=torch.zeros_like(valid)[None] if clip.moving is None else clip.moving[chosen][None],
+            distortion=torch.tensor([clip.distortion]),
         )
     )
 
@@ -91,7 +101,7 @@ def sample_window(
 
 def stack(windows: Sequence[Batch]) -> Batch:
     """One batch of several windows of equal size."""
-    names = ("images", "depth", "valid", "world_from_camera", "focal")
+    names = [field.name for field in fields(Batch)]
     return Batch(*(torch.cat([getattr(window, name) for window in windows]) for name in names))
 
 
@@ -100,12 +110,13 @@ def mirror(batch: Batch, *, axis: int) -> Batch:
     flip = torch.eye(4)
     flip[axis, axis] = -1
     dim = -1 - axis
-    return Batch(
-        batch.images.flip(dim),
-        batch.depth.flip(dim),
-        batch.valid.flip(dim),
-        flip @ batch.world_from_camera @ flip,
-        batch.focal,
+    return replace(
+        batch,
+        images=batch.images.flip(dim),
+        depth=batch.depth.flip(dim),
+        valid=batch.valid.flip(dim),
+        world_from_camera=flip @ batch.world_from_camera @ flip,
+        moving=batch.moving.flip(dim),
     )
 
 
@@ -119,9 +130,17 @@ def crop_centre(batch: Batch, share: float) -> Batch:
     y = torch.linspace(-1 + 1 / height, 1 - 1 / height, height) * share
     grid = torch.stack([x.expand(height, width), y[:, None].expand(height, width)], -1).expand(b * t, -1, -1, -1)
     images = F.grid_sample(batch.images.flatten(0, 1), grid, align_corners=False)
-    depth = F.grid_sample(batch.depth.flatten(0, 1)[:, None], grid, mode="nearest", align_corners=False)
-    depth = depth[:, 0].unflatten(0, (b, t))
-    cropped = Batch(images.unflatten(0, (b, t)), depth, depth > 0, batch.world_from_camera, batch.focal / share)
+    labels = torch.stack([batch.depth, batch.moving.to(batch.depth.dtype)], 2).flatten(0, 1)
+    labels = F.grid_sample(labels, grid, mode="nearest", align_corners=False).unflatten(0, (b, t))
+    depth = labels[:, :, 0]
+    cropped = replace(
+        batch,
+        images=images.unflatten(0, (b, t)),
+        depth=depth,
+        valid=depth > 0,
+        focal=batch.focal / share,
+        moving=labels[:, :, 1] > 0,
+    )
     return _scaled(cropped) if bool((depth > 0).any()) else batch
 
 
@@ -131,7 +150,7 @@ def _scaled(batch: Batch) -> Batch:
     mean = batch.depth.sum((1, 2, 3)) / count
     poses = batch.world_from_camera.clone()
     poses[:, :, :3, 3] /= mean[:, None, None]
-    return Batch(batch.images, batch.depth / mean[:, None, None, None], batch.valid, poses, batch.focal)
+    return replace(batch, depth=batch.depth / mean[:, None, None, None], world_from_camera=poses)
 
 
 def _draw_index(length: int, frames: int, random: np.random.Generator, slow_chance: float) -> list[int]:
@@ -154,4 +173,4 @@ def _recolour(batch: Batch, random: np.random.Generator, augmentation: Augmentat
     tint = 1 + random.uniform(-augmentation.tint, augmentation.tint, 3)
     factor = torch.tensor(gain * tint, dtype=torch.float32)[:, None, None]
     images = (batch.images.clamp_min(1e-4).pow(gamma) * factor).clamp(0, 1)
-    return Batch(images, batch.depth, batch.valid, batch.world_from_camera, batch.focal)
+    return replace(batch, images=images)

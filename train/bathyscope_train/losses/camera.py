@@ -1,5 +1,7 @@
 """Supervised cameras: motions of pairs, the flow that they induce, and the focal length."""
 
+from dataclasses import replace
+
 from jaxtyping import Float
 from torch import Tensor
 
@@ -25,8 +27,8 @@ def motion_loss(motion: Motion, true: Motion) -> Float[Tensor, ""]:
 
 
 def induced_flow_loss(motion: Motion, true: TrueMatches) -> Float[Tensor, ""]:
-    """Distance in cells between where a motion carries the true points and where they truly appear."""
-    return flow_loss(project(true.points, motion, true.focal), true)
+    """Distance in cells between where a motion and the true one carry the true points, seen without distortion."""
+    return flow_loss(project(true.points, motion, true.focal), replace(true, positions=true.ideal))
 
 
 def focal_loss(focal: Float[Tensor, "b"], true: Float[Tensor, "b"]) -> Float[Tensor, ""]:

@@ -1,5 +1,6 @@
 """Supervised depth: logarithmic differences, their gradients at two distances, and an honest confidence."""
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -30,6 +31,35 @@ def gradient_loss(
         across = masked_mean((error[..., gap:] - error[..., :-gap]).abs(), valid[..., gap:] & valid[..., :-gap])
         total = total + (down + across) / 2
     return total
+
+
+def normal_loss(
+    depth: Float[Tensor, "b t h w"],
+    true: Float[Tensor, "b t h w"],
+    valid: Bool[Tensor, "b t h w"],
+    focal: Float[Tensor, "b"],
+) -> Float[Tensor, ""]:
+    """Mean of 1 - cosine between the normals of the two surfaces, over pixels whose neighbours are valid."""
+    cosine = (surface_normals(depth, focal) * surface_normals(true.clamp_min(1e-6), focal)).sum(-1)
+    whole = valid[..., 1:-1, 1:-1] & valid[..., 2:, 1:-1] & valid[..., :-2, 1:-1]
+    whole = whole & valid[..., 1:-1, 2:] & valid[..., 1:-1, :-2]
+    return masked_mean(1 - cosine, whole)
+
+
+def surface_normals(depth: Float[Tensor, "b t h w"], focal: Float[Tensor, "b"]) -> Float[Tensor, "b t h2 w2 3"]:
+    """Unit normals of the surface through the pixels' points, by central differences; one pixel less on each side.
+
+    The principal point is the centre of the image.
+    """
+    height, width = depth.shape[-2:]
+    scale = 1 / focal[:, None, None, None]
+    x = (torch.arange(width, device=depth.device, dtype=depth.dtype) + 0.5 - width / 2) * scale
+    y = (torch.arange(height, device=depth.device, dtype=depth.dtype) + 0.5 - height / 2)[:, None] * scale
+    points = torch.stack([x * depth, y * depth, depth], -1)
+    across = points[..., 1:-1, 2:, :] - points[..., 1:-1, :-2, :]
+    along = points[..., 2:, 1:-1, :] - points[..., :-2, 1:-1, :]
+    normal = torch.linalg.cross(across, along)
+    return normal / (normal.square().sum(-1, keepdim=True) + 1e-20).sqrt()
 
 
 def confidence_loss(

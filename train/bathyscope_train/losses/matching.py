@@ -2,19 +2,23 @@
 
 from dataclasses import dataclass
 
+import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bathyscope_train.data.windows import Batch
 from bathyscope_train.losses.depth import masked_mean
 from bathyscope_train.model.correspondence import Correlation, query_centres, query_depth
 from bathyscope_train.model.pose_layer import NEAREST, Motion, carry, project, rays
 from bathyscope_train.model.rigid import relative_motion
 from bathyscope_train.model.stem import CELL
+from bathyscope_train.model.trajectory import ClipPairs
 
 _SAME_SURFACE = 0.06
 _LARGEST_FLOW_ERROR = 20.0
 _CERTAIN_REACH = 9.5
+_NEWTON_STEPS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,42 +32,57 @@ class TrueMatches:
     queries: Float[Tensor, "q 2"]
     positions: Float[Tensor, "e q 2"]
     """Where they appear in the target frame."""
+    ideal: Float[Tensor, "e q 2"]
+    """Where they would appear without the lens's distortion."""
     visible: Bool[Tensor, "e q"]
-    """Inside the target frame and not hidden there: its depth agrees within 6 %."""
+    """Inside the target frame and not hidden there: its depth agrees within 6 %, and nothing moves by itself."""
 
 
-def true_matches(
-    depth: Float[Tensor, "b t h w"],
-    world_from_camera: Float[Tensor, "b t 4 4"],
-    focal: Float[Tensor, "b"],
-    source: Int[Tensor, "p"],
-    target: Int[Tensor, "p"],
-) -> TrueMatches:
+def true_matches(batch: Batch, pairs: ClipPairs) -> TrueMatches:
     """True matches of p pairs of frames of each clip (e = b p, clip-major).
 
     Args:
-        depth: True depth, 0 where unknown; the unit of the poses.
-        world_from_camera: True poses.
-        focal: Focal length in pixels; the principal point is the centre of the image.
-        source: Frames that the matches start from.
-        target: Frames in which they are sought.
+        batch: Windows with true depth, poses, focal length, distortion and what moves by itself.
+        pairs: What is matched.
     """
+    source, target = pairs.source, pairs.target
+    depth = batch.depth
     height, width = depth.shape[-2:]
-    pairs = source.shape[0]
-    cells = (focal / CELL)[:, None].expand(-1, pairs).flatten()
+    count = source.shape[0]
+    cells = (batch.focal / CELL)[:, None].expand(-1, count).flatten()
+    bend = batch.distortion[:, None].expand(-1, count, 2).flatten(0, 1)
     principal = depth.new_tensor([width, height]) / (2 * CELL)
     queries = query_centres(-(-height // CELL), -(-width // CELL), like=depth) - principal
     distance = query_depth(depth)[:, source].flatten(0, 1)
-    points = rays(queries.expand(*distance.shape, 2), cells[:, None].expand(distance.shape)) * distance[..., None]
-    motion = Motion(*(part.flatten(0, 1) for part in relative_motion(world_from_camera, source, target)))
-    positions = project(points, motion, cells)
-    normalised = (positions / principal)[:, None]
-    seen = F.grid_sample(depth[:, target].flatten(0, 1)[:, None], normalised, mode="nearest", align_corners=False)
+    shown = undistort(queries / cells[:, None, None], bend) * cells[:, None, None]
+    points = rays(shown, cells[:, None].expand(distance.shape)) * distance[..., None]
+    motion = Motion(*(part.flatten(0, 1) for part in relative_motion(batch.world_from_camera, source, target)))
+    ideal = project(points, motion, cells)
+    positions = distort(ideal / cells[:, None, None], bend) * cells[:, None, None]
+    labels = torch.stack([depth, batch.moving.to(depth.dtype)], 2)[:, target].flatten(0, 1)
+    seen = F.grid_sample(labels, (positions / principal)[:, None], mode="nearest", align_corners=False)[:, :, 0]
     expected = carry(points, motion)[..., 2]
     inside = (positions.abs() < principal).all(-1)
-    same = (seen[:, 0, 0] / expected - 1).abs() < _SAME_SURFACE
-    visible = inside & same & (distance > 0) & (expected > NEAREST)
-    return TrueMatches(motion, points, cells, queries, positions, visible)
+    same = (seen[:, 0] / expected - 1).abs() < _SAME_SURFACE
+    still = (query_depth(batch.moving.to(depth.dtype))[:, source].flatten(0, 1) == 0) & (seen[:, 1] == 0)
+    visible = inside & same & still & (distance > 0) & (expected > NEAREST)
+    return TrueMatches(motion, points, cells, queries, positions, ideal, visible)
+
+
+def distort(points: Float[Tensor, "e q 2"], bend: Float[Tensor, "e 2"]) -> Float[Tensor, "e q 2"]:
+    """Where a lens with radial distortion ``bend`` = (k1, k2) shows normalised points."""
+    square = points.square().sum(-1, keepdim=True)
+    return points * (1 + square * (bend[:, None, :1] + bend[:, None, 1:] * square))
+
+
+def undistort(points: Float[Tensor, "e q 2"], bend: Float[Tensor, "e 2"]) -> Float[Tensor, "e q 2"]:
+    """The inverse of :func:`distort`, by Newton's iteration on the radius."""
+    radius = points.square().sum(-1, keepdim=True).sqrt()
+    bare, k1, k2 = radius, bend[:, None, :1], bend[:, None, 1:]
+    for _ in range(_NEWTON_STEPS):
+        square = bare.square()
+        bare = bare - (bare * (1 + square * (k1 + k2 * square)) - radius) / (1 + square * (3 * k1 + 5 * k2 * square))
+    return points * bare / radius.clamp_min(1e-9)
 
 
 def matching_cross_entropy(

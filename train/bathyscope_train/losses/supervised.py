@@ -3,17 +3,17 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Int
 from pydantic import BaseModel, NonNegativeFloat
 from torch import Tensor
 
 from bathyscope_train.data.windows import Batch
 from bathyscope_train.losses.camera import focal_loss, induced_flow_loss, motion_loss
-from bathyscope_train.losses.depth import confidence_loss, gradient_loss, log_depth_loss, safe_log
+from bathyscope_train.losses.depth import confidence_loss, gradient_loss, log_depth_loss, normal_loss, safe_log
 from bathyscope_train.losses.gaussian_targets import gaussian_loss
 from bathyscope_train.losses.matching import flow_loss, matching_cross_entropy, true_matches
 from bathyscope_train.model.matching_camera_head import MatchingCameraHead, image_diagonal
 from bathyscope_train.model.network import DenseMaps, Features, Network
+from bathyscope_train.model.trajectory import ClipPairs
 
 
 class LossWeights(BaseModel, frozen=True, extra="forbid"):
@@ -21,13 +21,18 @@ class LossWeights(BaseModel, frozen=True, extra="forbid"):
 
     depth: NonNegativeFloat = 1.0
     gradient: NonNegativeFloat = 0.5
+    normals: NonNegativeFloat = 0.1
     confidence: NonNegativeFloat = 0.1
     focal: NonNegativeFloat = 0.5
     matching: NonNegativeFloat = 0.1
     flow: NonNegativeFloat = 0.05
     motion: NonNegativeFloat = 1.0
     induced_flow: NonNegativeFloat = 0.03
+    corrected_depth: NonNegativeFloat = 0.5
     gaussians: NonNegativeFloat = 0.2
+
+
+_CAMERA_TERMS = ("focal", "matching", "flow", "motion", "induced_flow", "corrected_depth")
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,14 +43,24 @@ class Objective:
     terms: dict[str, Tensor]
 
 
+@dataclass(frozen=True, slots=True)
+class SolverInput:
+    """What the motion solver is given in this step, so that it learns from good and from poor guesses."""
+
+    true_focal: bool = True
+    """The true focal length as first estimate, rather than the predicted one times ``focal_error``."""
+    focal_error: float = 1.0
+    true_motion: bool = False
+    """Correct the depth under the true motions, rather than the estimated ones."""
+
+
 def supervised_objective(
     network: Network,
     batch: Batch,
-    source: Int[Tensor, "p"],
-    target: Int[Tensor, "p"],
+    pairs: ClipPairs,
     weights: LossWeights,
+    given: SolverInput | None = None,
     *,
-    true_focal: bool = True,
     autocast: bool = False,
 ) -> Objective:
     """Run the network on a batch and compare everything it says with the truth.
@@ -53,10 +68,9 @@ def supervised_objective(
     Args:
         network: With a matching camera head.
         batch: Windows with depth, poses and focal length.
-        source: Frames that supervised motions start from.
-        target: Frames that they lead to.
+        pairs: Pairs of frames whose motions are supervised.
         weights: Factors of the terms.
-        true_focal: Give the solver the true focal length rather than the predicted one.
+        given: What the solver starts from.
         autocast: Run the transformer in bfloat16; heads, solver and losses stay in float32.
     """
     with torch.autocast(batch.images.device.type, dtype=torch.bfloat16, enabled=autocast):
@@ -65,48 +79,55 @@ def supervised_objective(
     terms = {
         "depth": log_depth_loss(maps.depth, batch.depth, batch.valid),
         "gradient": gradient_loss(maps.depth, batch.depth, batch.valid),
-        "confidence": confidence_loss(maps.confidence, (maps.depth.log() - safe_log(batch.depth)).abs(), batch.valid),
     }
-    if maps.gaussians is not None:
-        terms["gaussians"] = gaussian_loss(maps.gaussians, maps.depth.detach(), batch.depth, batch.valid, batch.focal)
     factors = weights.model_dump()
-    if any(factors[name] > 0 for name in ("focal", "matching", "flow", "motion", "induced_flow")):
-        terms |= _camera_terms(network, features, maps, batch, pairs=(source, target), true_focal=true_focal)
+    if factors["normals"] > 0:
+        terms["normals"] = normal_loss(maps.depth, batch.depth, batch.valid, batch.focal)
+    final = maps.depth.detach()
+    if any(factors[name] > 0 for name in _CAMERA_TERMS):
+        more, final = _camera_terms(network, features, maps, batch, pairs=pairs, given=given or SolverInput())
+        terms |= more
+    error = (final.detach().log() - safe_log(batch.depth)).abs()
+    terms["confidence"] = confidence_loss(maps.confidence, error, batch.valid)
+    if maps.gaussians is not None:
+        terms["gaussians"] = gaussian_loss(maps.gaussians, final.detach(), batch.depth, batch.valid, batch.focal)
     total = torch.stack([factors[name] * term for name, term in terms.items()]).sum()
     return Objective(total, terms)
 
 
 def _camera_terms(
-    network: Network,
-    features: Features,
-    maps: DenseMaps,
-    batch: Batch,
-    *,
-    pairs: tuple[Tensor, Tensor],
-    true_focal: bool,
-) -> dict[str, Tensor]:
+    network: Network, features: Features, maps: DenseMaps, batch: Batch, *, pairs: ClipPairs, given: SolverInput
+) -> tuple[dict[str, Tensor], Tensor]:
+    """Terms of the camera head, and the depth as it corrected it."""
     head = network.camera_head
     assert isinstance(head, MatchingCameraHead)
     size = (batch.depth.shape[-2], batch.depth.shape[-1])
     focal = head.focal(features.camera) * image_diagonal(*size, like=batch.depth)
     # The solver sees the predicted depth as it is served, but sends no gradient into it: simpler and as good.
     depth = maps.depth.detach()
-    estimates = head.estimate(
-        head.features(features.taps[-1], features.stem_maps, size),
-        depth,
-        batch.focal if true_focal else focal.detach(),
-        *pairs,
-    )
-    true = true_matches(batch.depth, batch.world_from_camera, batch.focal, *pairs)
-    first, last = estimates.rounds[0], estimates.rounds[-1]
+    clip = head.describe(features.taps[-1], features.stem_maps, depth)
+    first = batch.focal if given.true_focal else focal.detach() * given.focal_error
+    estimates = head.estimate(clip, first, pairs)
+    refined = head.refine_focal(clip, estimates, first, pairs)
+    true = true_matches(batch, pairs)
+    motion = true.motion if given.true_motion else None
+    correction = head.correct_depth(clip, estimates, refined.detach(), pairs, motion=motion)
+    corrected = head.corrected(clip, depth, correction)
+    sharper = clip.depth * correction.detach().exp()
+    final = head.resolve(clip, estimates, refined.detach(), pairs, depth=sharper)
+    rounds = [*(each.solution for each in estimates.rounds), final]
+    shares = [0.5] + [1.0] * (len(rounds) - 1)
     return {
-        "focal": focal_loss(focal, batch.focal),
-        "matching": matching_cross_entropy(estimates.correlation, true, estimates.principal),
+        "focal": focal_loss(focal, batch.focal) + focal_loss(refined, batch.focal),
+        "matching": matching_cross_entropy(estimates.correlation, true, clip.principal),
         "flow": torch.stack([flow_loss(each.matches, true) for each in estimates.rounds]).sum(),
-        "motion": 0.5 * motion_loss(first.solution.motion, true.motion)
-        + motion_loss(last.solution.motion, true.motion),
-        "induced_flow": induced_flow_loss(last.solution.motion, true),
-    }
+        "motion": torch.stack(
+            [share * motion_loss(each.motion, true.motion) for share, each in zip(shares, rounds, strict=True)]
+        ).sum(),
+        "induced_flow": induced_flow_loss(final.motion, true),
+        "corrected_depth": log_depth_loss(corrected, batch.depth, batch.valid)
+        + 0.5 * gradient_loss(corrected, batch.depth, batch.valid),
+    }, corrected
 
 
 def _in_float32(features: Features) -> Features:

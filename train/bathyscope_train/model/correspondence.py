@@ -22,7 +22,8 @@ _REACH = 10.0
 _OUT_OF_REACH = -20.0
 _INITIAL_TEMPERATURE = 2.7
 _LARGEST_FACTOR = 60.0
-_CONTEXT = 32
+CONTEXT = 32
+"""Channels of the features of a query."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +65,7 @@ class MatchingEncoder(nn.Module):
             ResidualConv(width),
         )
         self.descriptor = nn.Conv2d(width, width, 1)
-        self.context = nn.Conv2d(width, _CONTEXT, 1)
+        self.context = nn.Conv2d(width, CONTEXT, 1)
 
     def forward(
         self, quarter: Float[Tensor, "b t c gh gw"], tokens: Float[Tensor, "b t n k"], grid: tuple[int, int]
@@ -87,7 +88,7 @@ class Matcher(nn.Module):
     def __init__(self, hidden: int = 96) -> None:
         super().__init__()
         self.temperature = nn.Parameter(torch.tensor(_INITIAL_TEMPERATURE))
-        inputs = _WINDOW + 2 + 2 + 2 + 2 + _CONTEXT + 1 + 2
+        inputs = _WINDOW + 2 + 2 + 2 + 2 + CONTEXT + 1 + 2
         self.update = nn.Sequential(
             nn.Conv2d(inputs, hidden, 3, padding=1),
             nn.GELU(),

@@ -1,8 +1,9 @@
-"""Camera head of the tiny preset: cameras from matches, predicted depth and a least-squares solver.
+"""Camera head of the small presets: cameras from matches, predicted depth and a least-squares solver.
 
 A camera token alone does not learn motion from a few thousand examples. Correspondences do: they are
 supervised densely, and the step from them to a motion is known geometry (:mod:`.pose_layer`). The field of
-view comes from the camera tokens.
+view begins with what the camera tokens say and is corrected by the motions (:mod:`.focal_layer`), unless the
+caller knows it; parallax corrects the depth (:mod:`.depth_refiner`), and the corrected depth the motions.
 """
 
 from collections.abc import Sequence
@@ -10,23 +11,45 @@ from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from bathyscope_train.model.correspondence import (
+    CONTEXT,
     Correlation,
     Matcher,
     MatchingEncoder,
     MatchingFeatures,
+    query_centres,
     query_depth,
 )
+from bathyscope_train.model.depth_refiner import DepthRefiner, parallax, spread_queries
+from bathyscope_train.model.focal_layer import focal_step, fuse_focal
 from bathyscope_train.model.pose_encoding import matrix_to_quaternion
+from bathyscope_train.model.pose_graph import settle_trajectory
 from bathyscope_train.model.pose_layer import Motion, Solution, project, rays, solve_motion
 from bathyscope_train.model.stem import CELL
-from bathyscope_train.model.trajectory import clip_pairs, fuse_trajectory
+from bathyscope_train.model.trajectory import ClipPairs, clip_pairs, fuse_trajectory
 
 _TYPICAL_FOCAL = 0.45
 _OUTSIDE = 4.0
+_FOCAL_STEPS = 2
+_INITIAL_FOCAL_PRIOR = 3.0  # exp(3) = 20: the first estimate is good to about 22 %
+_FINAL_ITERATIONS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """What is known of a clip before its motions; lengths in units of its mean depth."""
+
+    features: MatchingFeatures
+    size: tuple[int, int]
+    principal: Float[Tensor, "2"]
+    """Principal point, in cells."""
+    queries: Float[Tensor, "q 2"]
+    """Queries, in cells from the principal point."""
+    depth: Float[Tensor, "b t q"]
+    """Predicted depth at the queries."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +67,22 @@ class PairEstimates:
     """Motions of pairs of frames, and how they came about (which training supervises)."""
 
     correlation: Correlation
-    principal: Float[Tensor, "2"]
-    """Principal point, in cells."""
     rounds: tuple[Round, ...]
 
     @property
-    def solution(self) -> Solution:
-        """The last round's motions."""
-        return self.rounds[-1].solution
+    def last(self) -> Round:
+        """The last look."""
+        return self.rounds[-1]
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSolution:
+    """What the head says about a clip."""
+
+    pose_encodings: Float[Tensor, "i b t 9"]
+    """After each iteration of the head; the matching head gives only the final one."""
+    depth: Float[Tensor, "b t h w"]
+    """The predicted depth, corrected by parallax."""
 
 
 class FocalHead(nn.Module):
@@ -71,7 +102,7 @@ class FocalHead(nn.Module):
 
 
 class MatchingCameraHead(nn.Module):
-    """Pose encodings of a clip from its features and predicted depth.
+    """Pose encodings and corrected depth of a clip from its features and predicted depth.
 
     Args:
         width: Channels of a camera token and of a tapped token.
@@ -89,8 +120,10 @@ class MatchingCameraHead(nn.Module):
         self.rounds = rounds
         self.iterations = iterations
         self.focal = FocalHead(width)
+        self.focal_prior = nn.Parameter(torch.tensor(_INITIAL_FOCAL_PRIOR))
         self.encoder = MatchingEncoder(width, stem_channels)
         self.matcher = Matcher()
+        self.refiner = DepthRefiner(CONTEXT)
 
     def forward(
         self,
@@ -98,70 +131,65 @@ class MatchingCameraHead(nn.Module):
         tokens: Float[Tensor, "b t n c"],
         stem_maps: Sequence[Float[Tensor, "b t k gh gw"]],
         depth: Float[Tensor, "b t h w"],
-    ) -> Float[Tensor, "1 b t 9"]:
-        """Pose encodings; camera 0 is the identity, lengths are in the unit of ``depth``."""
-        b, t, height, width = depth.shape
-        focal = self.focal(camera_tokens) * image_diagonal(height, width, like=depth)
-        source, target = clip_pairs(t, depth.device)
+        focal: Float[Tensor, "b"] | None = None,
+    ) -> CameraSolution:
+        """Cameras and corrected depth; camera 0 is the identity, lengths are in the unit of ``depth``.
+
+        Args:
+            camera_tokens: Camera token of each frame.
+            tokens: Patch tokens of the last tapped layer.
+            stem_maps: Maps of the image stem; the finest is last.
+            depth: Predicted depth.
+            focal: Known focal length in pixels; where it is 0 (or not given), it is estimated.
+        """
+        t, height, width = depth.shape[1:]
         scale = depth.mean((1, 2, 3))
-        solution = self.estimate(
-            self.features(tokens, stem_maps, (height, width)),
-            depth / scale[:, None, None, None],
-            focal,
-            source,
-            target,
-        ).solution
-        pairs = Motion(
-            solution.motion.rotation.unflatten(0, (b, 3 * t)), solution.motion.translation.unflatten(0, (b, 3 * t))
-        )
-        trajectory = fuse_trajectory(pairs, solution.information.unflatten(0, (b, 3 * t)))
-        fields = [2 * torch.atan(0.5 * side / focal) for side in (height, width)]
+        clip = self.describe(tokens, stem_maps, depth / scale[:, None, None, None])
+        pairs = clip_pairs(t, depth.device)
+        first = self.focal(camera_tokens) * image_diagonal(height, width, like=depth)
+        known = first.new_zeros(first.shape) if focal is None else focal
+        first = torch.where(known > 0, known, first)
+        estimates = self.estimate(clip, first, pairs)
+        refined = self.refine_focal(clip, estimates, first, pairs)
+        refined = torch.where(known > 0, known, refined)
+        correction = self.correct_depth(clip, estimates, refined, pairs)
+        solution = self.resolve(clip, estimates, refined, pairs, depth=clip.depth * correction.exp())
+        trajectory = _trajectory(solution, pairs)
+        fields = [2 * torch.atan(0.5 * side / refined) for side in (height, width)]
         encoding = [
             trajectory.translation * scale[:, None, None],
             matrix_to_quaternion(trajectory.rotation),
-            torch.stack(fields, -1)[:, None].expand(b, t, 2),
+            torch.stack(fields, -1)[:, None].expand(*trajectory.translation.shape[:2], 2),
         ]
-        return torch.cat(encoding, -1)[None]
+        return CameraSolution(torch.cat(encoding, -1)[None], self.corrected(clip, depth, correction))
 
-    def features(
-        self, tokens: Float[Tensor, "b t n c"], stem_maps: Sequence[Tensor], size: tuple[int, int]
-    ) -> MatchingFeatures:
-        """Matching features of images of ``size``."""
+    def describe(
+        self,
+        tokens: Float[Tensor, "b t n c"],
+        stem_maps: Sequence[Float[Tensor, "b t k gh gw"]],
+        depth: Float[Tensor, "b t h w"],
+    ) -> Clip:
+        """Matching features and queries of a clip; ``depth`` has clip mean about 1."""
+        size = (depth.shape[-2], depth.shape[-1])
         grid = (size[0] // self.patch_size, size[1] // self.patch_size)
         features: MatchingFeatures = self.encoder(stem_maps[-1], tokens, grid)
-        return features
+        principal = _principal_point(*size, like=depth)
+        rows, columns = features.descriptors.shape[-2:]
+        queries = query_centres(rows, columns, like=depth) - principal
+        return Clip(features, size, principal, queries, query_depth(depth))
 
-    def estimate(
-        self,
-        features: MatchingFeatures,
-        depth: Float[Tensor, "b t h w"],
-        focal: Float[Tensor, "b"],
-        source: Int[Tensor, "p"],
-        target: Int[Tensor, "p"],
-    ) -> PairEstimates:
-        """Motions of p pairs of frames of each clip (e = b p, clip-major).
-
-        Args:
-            features: From :meth:`features`.
-            depth: Z-depth with clip mean about 1.
-            focal: Focal length in pixels.
-            source: Frames that the motions start from.
-            target: Frames that they lead to.
-        """
-        height, width = depth.shape[-2:]
-        pairs = source.shape[0]
-        cells = (focal / CELL)[:, None].expand(-1, pairs).flatten()
+    def estimate(self, clip: Clip, focal: Float[Tensor, "b"], pairs: ClipPairs) -> PairEstimates:
+        """Motions of p pairs of frames of each clip (e = b p, clip-major), ``focal`` in pixels."""
+        source, target = pairs.source, pairs.target
+        cells = _per_pair(focal / CELL, pairs)
         correlation = self.matcher.correlate(
-            features.descriptors[:, source].flatten(0, 1), features.descriptors[:, target].flatten(0, 1)
+            clip.features.descriptors[:, source].flatten(0, 1), clip.features.descriptors[:, target].flatten(0, 1)
         )
-        context = features.context[:, source].flatten(0, 1)
-        distance = query_depth(depth)[:, source].flatten(0, 1)
-        principal = _principal_point(height, width, like=depth)
-        centred = correlation.queries - principal
-        points = (
-            rays(centred.expand(distance.shape[0], -1, -1), cells[:, None].expand(distance.shape)) * distance[..., None]
-        )
-        position = (centred / principal).expand(distance.shape[0], -1, -1)
+        context = clip.features.context[:, source].flatten(0, 1)
+        distance = clip.depth[:, source].flatten(0, 1)
+        principal = clip.principal
+        points = _points(clip, distance, cells)
+        position = (clip.queries / principal).expand(distance.shape[0], -1, -1)
         motion = Motion.none(points[:, 0])
         base = correlation.best
         rounds = []
@@ -175,13 +203,112 @@ class MatchingCameraHead(nn.Module):
             solution = solve_motion(points, matches, trust, cells, motion, iterations=self.iterations)
             motion = solution.motion
             rounds.append(Round(matches, trust, solution))
-        return PairEstimates(correlation, principal, tuple(rounds))
+        return PairEstimates(correlation, tuple(rounds))
+
+    def refine_focal(
+        self, clip: Clip, estimates: PairEstimates, first: Float[Tensor, "b"], pairs: ClipPairs
+    ) -> Float[Tensor, "b"]:
+        """Focal length in pixels that suits all motions of a clip, near the first estimate."""
+        b, p = first.shape[0], pairs.source.shape[0]
+        last = estimates.last
+        distance = clip.depth[:, pairs.source].flatten(0, 1)
+        shift = torch.zeros_like(first)
+        for _ in range(_FOCAL_STEPS):
+            cells = _per_pair(first * shift.exp() / CELL, pairs)
+            gradient, curvature = focal_step(
+                clip.queries,
+                distance,
+                last.matches,
+                last.trust,
+                focal=cells,
+                motion=last.solution.motion.detach(),
+            )
+            gradient, curvature = (part.unflatten(0, (b, p)) * pairs.inside for part in (gradient, curvature))
+            shift = shift + fuse_focal(gradient, curvature, shift, self.focal_prior.exp())
+        return first * shift.exp()
+
+    def resolve(
+        self,
+        clip: Clip,
+        estimates: PairEstimates,
+        focal: Float[Tensor, "b"],
+        pairs: ClipPairs,
+        *,
+        depth: Float[Tensor, "b t q"],
+    ) -> Solution:
+        """Motions from the last matches, with another depth or focal length."""
+        cells = _per_pair(focal / CELL, pairs)
+        points = _points(clip, depth[:, pairs.source].flatten(0, 1), cells)
+        last = estimates.last
+        start = last.solution.motion.detach()
+        return solve_motion(points, last.matches, last.trust, cells, start, iterations=_FINAL_ITERATIONS)
+
+    def correct_depth(
+        self,
+        clip: Clip,
+        estimates: PairEstimates,
+        focal: Float[Tensor, "b"],
+        pairs: ClipPairs,
+        *,
+        motion: Motion | None = None,
+    ) -> Float[Tensor, "b t q"]:
+        """Addition to the logarithm of the depth at the queries, by parallax under the motions of the pairs.
+
+        Args:
+            clip: Depth that is to be corrected, features.
+            estimates: Matches of the pairs.
+            focal: Focal length in pixels.
+            pairs: What was matched.
+            motion: Motions (e, ...) instead of the estimated ones.
+        """
+        b, t = clip.depth.shape[:2]
+        cells = _per_pair(focal / CELL, pairs)
+        points = _points(clip, clip.depth[:, pairs.source].flatten(0, 1), cells)
+        last = estimates.last
+        motion = last.solution.motion.detach() if motion is None else motion
+        found = parallax(points, last.matches, last.trust, cells, motion)
+        frames = torch.arange(t, device=focal.device)
+        begins = (frames[:, None] == pairs.source[None]).to(focal.dtype) * pairs.inside
+        gradient, curvature = (begins @ part.unflatten(0, (b, -1)) for part in found)
+        correction: Tensor = self.refiner(
+            gradient, curvature, clip.depth.log(), clip.queries / clip.principal, clip.features.context
+        )
+        return correction
+
+    def corrected(
+        self, clip: Clip, depth: Float[Tensor, "b t h w"], correction: Float[Tensor, "b t q"]
+    ) -> Float[Tensor, "b t h w"]:
+        """``depth`` times the exponential of the correction."""
+        grid = (clip.features.context.shape[-2], clip.features.context.shape[-1])
+        maps = depth.flatten(0, 1)
+        factor = spread_queries(correction.flatten(0, 1).unflatten(-1, grid), maps).exp()
+        product: Tensor = (maps * factor).unflatten(0, (depth.shape[0], depth.shape[1]))
+        return product
 
 
 def image_diagonal(height: int, width: int, *, like: Tensor) -> Float[Tensor, ""]:
     """Length of the diagonal in pixels."""
     sides = [torch.full((), side, device=like.device, dtype=like.dtype) for side in (height, width)]
     return (sides[0].square() + sides[1].square()).sqrt()
+
+
+def _trajectory(solution: Solution, pairs: ClipPairs) -> Motion:
+    """Camera-from-first-camera motions from the solutions of a clip's pairs."""
+    count = pairs.source.shape[0]
+    motion = Motion(
+        solution.motion.rotation.unflatten(0, (-1, count)), solution.motion.translation.unflatten(0, (-1, count))
+    )
+    information = solution.information.unflatten(0, (-1, count))
+    return settle_trajectory(fuse_trajectory(motion, information), motion, information, pairs)
+
+
+def _per_pair(values: Float[Tensor, "b"], pairs: ClipPairs) -> Float[Tensor, "e"]:
+    return values[:, None].expand(-1, pairs.source.shape[0]).flatten()
+
+
+def _points(clip: Clip, depth: Float[Tensor, "e q"], cells: Float[Tensor, "e"]) -> Float[Tensor, "e q 3"]:
+    """The queries as points of the source camera."""
+    return rays(clip.queries.expand(*depth.shape, 2), cells[:, None].expand(depth.shape)) * depth[..., None]
 
 
 def _principal_point(height: int, width: int, *, like: Tensor) -> Float[Tensor, "2"]:

@@ -6,7 +6,7 @@ the dense heads in chunks of frames, the cameras last. :meth:`Network.forward` p
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -18,7 +18,7 @@ from bathyscope_train.model.camera_head import CameraHead
 from bathyscope_train.model.dense_head import DepthHead, activate_depth
 from bathyscope_train.model.gaussian_head import GaussianHead
 from bathyscope_train.model.light_dense_head import LightDepthHead, LightGaussianHead
-from bathyscope_train.model.matching_camera_head import MatchingCameraHead
+from bathyscope_train.model.matching_camera_head import CameraSolution, MatchingCameraHead
 from bathyscope_train.model.presets import (
     ConvStemSettings,
     LightHeadSettings,
@@ -58,6 +58,8 @@ class Prediction:
     pose_encodings: Float[Tensor, "i b t 9"]
     """Pose encodings after each iteration of the camera head (see :mod:`~bathyscope_train.model.pose_encoding`)."""
     maps: DenseMaps
+    single_view_depth: Float[Tensor, "b t h w"] | None = None
+    """Depth before the motion between the frames corrected it, as the network gave it."""
 
     @property
     def pose_encoding(self) -> Float[Tensor, "b t 9"]:
@@ -129,26 +131,29 @@ class Network(nn.Module):
         raw: Tensor = self.gaussian_param_head(taps, frames)
         return raw
 
-    def cameras(self, features: Features, depth: Float[Tensor, "b t h w"]) -> Float[Tensor, "b t 9"]:
-        """Final pose encoding of every frame."""
-        return self.camera_iterations(features, depth)[-1]
-
-    def camera_iterations(self, features: Features, depth: Float[Tensor, "b t h w"]) -> Float[Tensor, "i b t 9"]:
-        """Pose encodings after each iteration; the iterative head makes no use of ``depth``."""
+    def cameras(
+        self, features: Features, depth: Float[Tensor, "b t h w"], focal: Float[Tensor, "b"] | None = None
+    ) -> CameraSolution:
+        """Pose encodings after each iteration, and the depth as corrected by the motion between the frames."""
         with _float32(features.camera.device):
             camera = features.camera.float()
             if isinstance(self.camera_head, MatchingCameraHead):
                 maps = [each.float() for each in features.stem_maps]
-                solved: Tensor = self.camera_head(camera, features.taps[-1].float(), maps, depth.float())
+                solved: CameraSolution = self.camera_head(camera, features.taps[-1].float(), maps, depth.float(), focal)
                 return solved
-            encodings: Tensor = self.camera_head(camera)
-        return encodings
+            return CameraSolution(self.camera_head(camera), depth)
 
-    def forward(self, images: Float[Tensor, "b t 3 h w"]) -> Prediction:
-        """Predict everything for clips of images in [0, 1]; sides are multiples of the patch size."""
+    def forward(self, images: Float[Tensor, "b t 3 h w"], focal: Float[Tensor, "b"] | None = None) -> Prediction:
+        """Predict everything for clips of images in [0, 1]; sides are multiples of the patch size.
+
+        Args:
+            images: The clips.
+            focal: Focal length in pixels where it is known, 0 where not; only the matching camera head makes use of it.
+        """
         features = self.encode(images)
         maps = self.dense(features, images)
-        return Prediction(pose_encodings=self.camera_iterations(features, maps.depth), maps=maps)
+        solved = self.cameras(features, maps.depth, focal)
+        return Prediction(solved.pose_encodings, replace(maps, depth=solved.depth), maps.depth)
 
 
 def build_camera_head(preset: NetworkPreset) -> nn.Module:

@@ -17,10 +17,12 @@ from bathyscope_train.model.rigid import rotate, rotation_exponential
 NEAREST = 0.05
 """Smallest depth behind which a projection is cut off, in units of the clip's mean depth."""
 
+NOISE_FLOOR = 0.02
+"""Variance of a match that no agreement of its pair can undercut, in cells^2."""
+
 _RELATIVE_DAMPING = 1e-3
 _ABSOLUTE_DAMPING = 1e-2
 _LARGEST_UPDATE = 1.0
-_NOISE_FLOOR = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +50,8 @@ class Solution:
     motion: Motion
     information: Float[Tensor, "*b 6 6"]
     """Normal matrix over residual variance, for (translation, rotation): how far each pair may be trusted."""
+    variance: Float[Tensor, "*b"]
+    """Weighted mean squared residual, cells^2."""
 
 
 def rays(cells: Float[Tensor, "*b 2"], focal: Float[Tensor, "*b"]) -> Float[Tensor, "*b 3"]:
@@ -90,19 +94,39 @@ def solve_motion(
     motion = start
     for _ in range(iterations):
         matrix, vector, _ = _normal_equations(points, target, weights, focal, motion)
-        damping = _RELATIVE_DAMPING * matrix * torch.eye(6, dtype=matrix.dtype, device=matrix.device)
-        damping = damping + _ABSOLUTE_DAMPING * torch.eye(6, dtype=matrix.dtype, device=matrix.device)
-        update = solve_positive(matrix + damping, vector).clamp(-_LARGEST_UPDATE, _LARGEST_UPDATE)
+        update = solve_positive(damped(matrix), vector).clamp(-_LARGEST_UPDATE, _LARGEST_UPDATE)
         turn = rotation_exponential(update[..., 3:])
         motion = Motion(turn @ motion.rotation, rotate(turn, motion.translation) + update[..., :3])
     matrix, _, variance = _normal_equations(points, target, weights, focal, motion)
-    return Solution(motion, matrix / (variance + _NOISE_FLOOR)[:, None, None])
+    return Solution(motion, matrix / (variance + NOISE_FLOOR)[:, None, None], variance)
 
 
-def _normal_equations(
-    points: Tensor, target: Tensor, weights: Tensor, focal: Tensor, motion: Motion
-) -> tuple[Float[Tensor, "e 6 6"], Float[Tensor, "e 6"], Float[Tensor, "e"]]:
-    """Normal matrix and vector (means over the points) and weighted mean squared residual of each pair."""
+@dataclass(frozen=True, slots=True)
+class Linearised:
+    """Projections of n points of each pair and how they change; rows are all x, then all y."""
+
+    moved: Float[Tensor, "e n 3"]
+    """The points in the target camera."""
+    residual: Float[Tensor, "e m"]
+    """Measured minus projected, in cells; m = 2 n."""
+    jacobian: Float[Tensor, "e m 6"]
+    """Derivative of the projection by a small motion (translation, rotation) from the left."""
+    weights: Float[Tensor, "e m"]
+
+    @property
+    def variance(self) -> Float[Tensor, "e"]:
+        """Weighted mean squared residual, cells^2."""
+        return (self.weights * self.residual.square()).sum(-1) / (self.weights.sum(-1) + 1e-6)
+
+
+def linearise(
+    points: Float[Tensor, "e n 3"],
+    target: Float[Tensor, "e n 2"],
+    weights: Float[Tensor, "e n 2"],
+    focal: Float[Tensor, "e"],
+    motion: Motion,
+) -> Linearised:
+    """The projections of the points under a motion, to first order."""
     moved = carry(points, motion)
     inverse = 1 / moved[..., 2]
     x, y = moved[..., 0] * inverse, moved[..., 1] * inverse
@@ -111,14 +135,30 @@ def _normal_equations(
     row_u = torch.stack([inverse, zero, -x * inverse, -x * y, one + x * x, -y], -1)
     row_v = torch.stack([zero, inverse, -y * inverse, -one - y * y, x * y, x], -1)
     jacobian = focal[:, None, None] * torch.cat([row_u, row_v], 1)
-    flat_weights = torch.cat([weights[..., 0], weights[..., 1]], 1)
-    flat_residual = torch.cat([residual[..., 0], residual[..., 1]], 1)
+    return Linearised(moved, stacked(residual), jacobian, stacked(weights))
+
+
+def stacked(pairs: Float[Tensor, "e n 2"]) -> Float[Tensor, "e m"]:
+    """All x, then all y."""
+    return torch.cat([pairs[..., 0], pairs[..., 1]], 1)
+
+
+def _normal_equations(
+    points: Tensor, target: Tensor, weights: Tensor, focal: Tensor, motion: Motion
+) -> tuple[Float[Tensor, "e 6 6"], Float[Tensor, "e 6"], Float[Tensor, "e"]]:
+    """Normal matrix and vector (means over the points) and weighted mean squared residual of each pair."""
+    line = linearise(points, target, weights, focal, motion)
     count = points.shape[1]
-    weighted = (jacobian * flat_weights[..., None]).transpose(-1, -2)
-    matrix = weighted @ jacobian / count
-    vector = (weighted @ flat_residual[..., None])[..., 0] / count
-    variance = (flat_weights * flat_residual.square()).sum(-1) / (flat_weights.sum(-1) + 1e-6)
-    return matrix, vector, variance
+    weighted = (line.jacobian * line.weights[..., None]).transpose(-1, -2)
+    matrix = weighted @ line.jacobian / count
+    vector = (weighted @ line.residual[..., None])[..., 0] / count
+    return matrix, vector, line.variance
+
+
+def damped(matrix: Float[Tensor, "*b n n"]) -> Float[Tensor, "*b n n"]:
+    """A normal matrix that can be inverted: a little more of its diagonal, and a constant that stands for no motion."""
+    identity = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
+    return matrix + _RELATIVE_DAMPING * matrix * identity + _ABSOLUTE_DAMPING * identity
 
 
 def solve_positive(matrix: Float[Tensor, "*b n n"], vector: Float[Tensor, "*b n"]) -> Float[Tensor, "*b n"]:
@@ -135,3 +175,10 @@ def solve_positive(matrix: Float[Tensor, "*b n n"], vector: Float[Tensor, "*b n"
         # Row p becomes the scaled pivot row; every other row loses its multiple of it.
         rows = rows * (1 - unit) - (rows[..., pivot : pivot + 1] * (1 - unit) - unit) * scaled
     return rows[..., -1]
+
+
+def solve_columns(matrix: Float[Tensor, "*b n n"], columns: Float[Tensor, "*b n k"]) -> Float[Tensor, "*b n k"]:
+    """``matrix^-1 columns`` for a small symmetric positive definite matrix."""
+    size, count = matrix.shape[-1], columns.shape[-1]
+    repeated = matrix[..., None, :, :].expand(*matrix.shape[:-2], count, size, size)
+    return solve_positive(repeated, columns.transpose(-1, -2)).transpose(-1, -2)

@@ -69,6 +69,14 @@ def compose(
     return outer[0] @ inner[0], rotate(outer[0], inner[1]) + outer[1]
 
 
+def inverse(
+    motion: tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]],
+) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]]:
+    """The motion that undoes ``motion``."""
+    back = motion[0].transpose(-1, -2)
+    return back, -rotate(back, motion[1])
+
+
 def adjoint(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 6 6"]:
     """Carries a small motion (translation, rotation vector) from before a motion to after it.
 

@@ -6,18 +6,23 @@ frame this is a recurrence: ``d_k = sum_g W_g (A_g d_{k-g} + m_g)``, with ``d_k`
 corrects the chain at frame k, ``m_g`` the disagreement of the pair (k - g, k) with the chain, ``A_g`` the
 adjoint of the pair's motion and ``W_g`` the information weights. Both the chain and the (affine) recurrence are
 evaluated by doubling, in log2(t) parallel steps: the graph has no loop and works at any clip length up to
-:data:`LONGEST_CLIP`.
+:data:`LONGEST_CLIP`. Loop pairs then pull on all frames at once (:mod:`.pose_graph`).
 """
+
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bathyscope_train.model.pose_layer import Motion, solve_positive
-from bathyscope_train.model.rigid import adjoint, compose, rotate, rotation_exponential, rotation_logarithm
+from bathyscope_train.model.pose_layer import Motion, solve_columns
+from bathyscope_train.model.rigid import adjoint, compose, inverse, rotate, rotation_exponential, rotation_logarithm
 
 GAPS = (1, 2, 4)
-"""Distances, in frames, between the frames of a pair."""
+"""Distances, in frames, of the pairs that the recurrence runs over."""
+
+GROUPS = 4
+"""Pairs that start in each frame: to k + 1, back to k - 2, to k + 4, and to its mirror image in the clip."""
 
 LONGEST_CLIP = 128
 """Frames that seven doublings reach; longer videos are cut into windows long before."""
@@ -26,50 +31,95 @@ _DOUBLINGS = 7
 _TINY_INFORMATION = 1e-4
 
 
-def clip_pairs(frames: int, device: torch.device | None = None) -> tuple[Int[Tensor, "e"], Int[Tensor, "e"]]:
-    """Source and target frames of all pairs of a clip: for each gap, one pair that ends in each frame.
+@dataclass(frozen=True, slots=True)
+class ClipPairs:
+    """All pairs of a clip, group by group, in each group one that starts in each frame."""
 
-    Pairs that would start before the clip start at frame 0 and are ignored by :func:`fuse_trajectory`. So
-    there are always 3 t pairs, at t = 1 too, and the count is a plain multiple of t in an exported graph.
+    source: Int[Tensor, "e"]
+    target: Int[Tensor, "e"]
+    inside: Float[Tensor, "e"]
+    """1 where source and target are two frames of the clip, 0 where the target had to be moved into it."""
+
+
+def clip_pairs(frames: int, device: torch.device | None = None) -> ClipPairs:
+    """The pairs of a clip: neighbours, both directions of time, and loops.
+
+    Every frame starts a pair forwards, one backwards and one to the frame as far from the clip's end as it is from
+    its beginning, so every depth can be checked by parallax and the ends of a clip are tied together. There are
+    always 4 t pairs, at t = 1 too, and the count is a plain multiple of t in an exported graph.
     """
-    target = torch.arange(frames, device=device)
-    sources = [(target - gap).clamp_min(0) for gap in GAPS]
-    return torch.cat(sources), torch.cat([target] * len(GAPS))
+    source = torch.arange(frames, device=device)
+    wanted = (source + 1, source - 2, source + 4, frames - 1 - source)
+    targets = [each.clamp(0, frames - 1) for each in wanted]
+    inside = [(each == kept) & (each != source) for each, kept in zip(wanted, targets, strict=True)]
+    return ClipPairs(torch.cat([source] * GROUPS), torch.cat(targets), torch.cat(inside).to(torch.float32))
 
 
 def fuse_trajectory(motion: Motion, information: Float[Tensor, "b e 6 6"]) -> Motion:
-    """Camera-from-first-camera motion of each frame, from the motions of :func:`clip_pairs`.
+    """Camera-from-first-camera motion of each frame, from the motions of :func:`clip_pairs` but for the loops.
 
     Args:
-        motion: Target-from-source motions, (b, 3 t, ...), gap-major.
+        motion: Target-from-source motions, (b, 4 t, ...), group-major.
         information: How far each direction of each motion may be trusted.
 
     Returns:
         Motions (b, t, ...) that map points of camera 0 into camera k; the first is the identity.
     """
-    frames = information.shape[1] // len(GAPS)
-    rotations = motion.rotation.unflatten(1, (len(GAPS), frames))
-    translations = motion.translation.unflatten(1, (len(GAPS), frames))
-    chain = chain_motions(Motion(rotations[:, 0], translations[:, 0]))
+    frames = information.shape[1] // GROUPS
+    arriving = _arriving(motion, information)
+    first = arriving[0][0]
+    chain = chain_motions(first)
     weights, offsets = [], []
     index = torch.arange(frames, device=information.device)
-    per_gap = information.unflatten(1, (len(GAPS), frames))
     inside = [(index >= gap).to(information.dtype)[:, None, None] for gap in GAPS]
     identity = torch.eye(6, dtype=information.dtype, device=information.device)
-    trusted = [per_gap[:, n] * inside[n] for n in range(len(GAPS))]
+    trusted = [arriving[n][1] * inside[n] for n in range(len(GAPS))]
     total = trusted[0] + trusted[1] + trusted[2] + _TINY_INFORMATION * identity
     for n, gap in enumerate(GAPS):
-        pair = Motion(rotations[:, n], translations[:, n])
+        pair = arriving[n][0]
         source = (index - gap).clamp_min(0)
         reached = compose((pair.rotation, pair.translation), (chain.rotation[:, source], chain.translation[:, source]))
-        disagreement = _difference(Motion(*reached), chain)
+        disagreement = difference(Motion(*reached), chain)
         share = trusted[n] if gap > 1 else trusted[n] + _TINY_INFORMATION * identity
-        share = _solve_columns(total, share) * inside[n]
+        share = solve_columns(total, share) * inside[n]
         weights.append(share @ adjoint(pair.rotation, pair.translation))
         offsets.append(rotate(share, disagreement))
     correction = _affine_recurrence(weights, offsets[0] + offsets[1] + offsets[2])
-    turn = rotation_exponential(correction[..., 3:])
-    return Motion(*compose((turn, correction[..., :3]), (chain.rotation, chain.translation)))
+    return move(correction, chain)
+
+
+def move(step: Float[Tensor, "*b 6"], motion: Motion) -> Motion:
+    """``motion``, then the small motion ``step`` (translation, rotation vector)."""
+    turn = rotation_exponential(step[..., 3:])
+    return Motion(*compose((turn, step[..., :3]), (motion.rotation, motion.translation)))
+
+
+def difference(reached: Motion, base: Motion) -> Float[Tensor, "*b 6"]:
+    """Small motion (translation, rotation vector) that takes ``base`` to ``reached`` from the left."""
+    turn = reached.rotation @ base.rotation.transpose(-1, -2)
+    return torch.cat([reached.translation - rotate(turn, base.translation), rotation_logarithm(turn)], -1)
+
+
+def _arriving(motion: Motion, information: Float[Tensor, "b e 6 6"]) -> list[tuple[Motion, Float[Tensor, "b t 6 6"]]]:
+    """For each gap g the motions (k - g, k) at index k, with their information; meaningless where k < g."""
+    frames = information.shape[1] // GROUPS
+    rotations = motion.rotation.unflatten(1, (GROUPS, frames))
+    translations = motion.translation.unflatten(1, (GROUPS, frames))
+    informations = information.unflatten(1, (GROUPS, frames))
+    index = torch.arange(frames, device=information.device)
+    found = []
+    for group, gap in ((0, 1), (1, 2), (2, 4)):
+        pair = Motion(rotations[:, group], translations[:, group])
+        weight = informations[:, group]
+        if group == 1:  # measured from k to k - 2: M = exp(d) M* has the inverse M*^-1 exp(-d)
+            carried = adjoint(pair.rotation, pair.translation)
+            weight = carried.transpose(-1, -2) @ weight @ carried
+            pair = Motion(*inverse((pair.rotation, pair.translation)))
+        else:
+            start = (index - gap).clamp_min(0)
+            pair, weight = Motion(pair.rotation[:, start], pair.translation[:, start]), weight[:, start]
+        found.append((pair, weight))
+    return found
 
 
 def chain_motions(steps: Motion) -> Motion:
@@ -85,18 +135,6 @@ def chain_motions(steps: Motion) -> Motion:
         # Before the clip there is frame 0, whose own product is the identity: clamping is exact.
         rotation, translation = compose((rotation, translation), (rotation[:, source], translation[:, source]))
     return Motion(rotation, translation)
-
-
-def _difference(reached: Motion, base: Motion) -> Float[Tensor, "b t 6"]:
-    """Small motion (translation, rotation vector) that takes ``base`` to ``reached`` from the left."""
-    turn = reached.rotation @ base.rotation.transpose(-1, -2)
-    return torch.cat([reached.translation - rotate(turn, base.translation), rotation_logarithm(turn)], -1)
-
-
-def _solve_columns(matrix: Float[Tensor, "b t 6 6"], columns: Float[Tensor, "b t 6 6"]) -> Float[Tensor, "b t 6 6"]:
-    """``matrix^-1 columns`` for a symmetric positive definite matrix."""
-    solved = solve_positive(matrix[..., None, :, :].expand(*matrix.shape[:-2], 6, 6, 6), columns.transpose(-1, -2))
-    return solved.transpose(-1, -2)
 
 
 def _affine_recurrence(weights: list[Float[Tensor, "b t 6 6"]], offset: Float[Tensor, "b t 6"]) -> Tensor:
