@@ -2,7 +2,9 @@
 
 The layout is the one that ``bathyscope evaluate`` reads: ``frames/NNNN.png``, ``depth/NNNN.png`` (uint16, times
 ``depth_scale``), ``poses.txt`` (file name and the 16 numbers of the camera-to-world matrix), ``intrinsics.json``
-and, where the field of view is not the whole image, ``mask.png`` (255 inside).
+and, where the field of view is not the whole image, ``mask.png`` (255 inside). Clips with instruments have
+``moving/NNNN.png`` (255 on an instrument); the two numbers of a bent lens are ``k1`` and ``k2`` of ``intrinsics.json``,
+OpenCV's.
 """
 
 import json
@@ -27,6 +29,10 @@ def write_dataset_folder(clip: SyntheticClip, folder: Path) -> None:
     """
     (folder / "frames").mkdir(parents=True, exist_ok=True)
     (folder / "depth").mkdir(exist_ok=True)
+    if clip.moving.any():
+        (folder / "moving").mkdir(exist_ok=True)
+        for index, moving in enumerate(clip.moving):
+            _write_png(folder / "moving" / f"{index:04d}.png", np.where(moving, 255, 0).astype(np.uint8))
     depth_scale = float(np.ceil(clip.depth.max())) / _LEVELS
     lines = ["# file, then world_from_camera row by row; millimetres, x right, y down, z forward\n"]
     for index, (frame, depth, pose) in enumerate(zip(clip.frames, clip.depth, clip.world_from_camera, strict=True)):
@@ -45,6 +51,8 @@ def write_dataset_folder(clip: SyntheticClip, folder: Path) -> None:
         "fy": float(clip.intrinsics[1, 1]),
         "cx": float(clip.intrinsics[0, 2]),
         "cy": float(clip.intrinsics[1, 2]),
+        "k1": clip.distortion.k1,
+        "k2": clip.distortion.k2,
         "pixel_origin": "(0,0) is the top-left corner of the top-left pixel",
         "depth": "uint16 PNG, z along the optical axis; depth_mm = value * depth_scale; 0 = nothing",
         "depth_scale": depth_scale,

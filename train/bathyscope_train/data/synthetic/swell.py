@@ -62,7 +62,7 @@ def draw_swell(random: np.random.Generator, ranges: LifeRanges, surface: Surface
     )
 
 
-def gain(swell: Swell, along: Array, across: Array, frame: float) -> Array:
+def gain(swell: Swell, along: npt.NDArray[np.floating], across: npt.NDArray[np.floating], frame: float) -> Array:
     """What the heights gain at places of the map.
 
     Args:
