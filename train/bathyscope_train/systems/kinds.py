@@ -9,8 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from bathyscope_train.systems.system import System, SystemOptions
+
+if TYPE_CHECKING:
+    from bathyscope_train.systems.video_networks import VideoNetwork
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Shape of every tensor of a file, by its name without the wrappers ``module.`` and ``model.``."""
@@ -36,6 +40,10 @@ class Kind:
     """Load it. Raises CheckpointError if the file does not hold exactly the network."""
     member: str | None = None
     """The file by which a folder of weights is recognised, for networks that are published as several files."""
+    preset: str | None = None
+    """The built-in preset that the weights fill, where there is one."""
+    video: Callable[[Path, str], VideoNetwork] | None = None
+    """Load it for an export, where it is a video network."""
 
 
 def bare(key: str) -> str:
@@ -95,16 +103,11 @@ def _is_endodav(shapes: Shapes) -> bool:
     )
 
 
-def _open_anysplat(path: Path, kind: Kind, options: SystemOptions) -> System:
+def _open_network(path: Path, kind: Kind, options: SystemOptions) -> System:
     from bathyscope_train.systems.networks import open_published
 
-    return open_published(path, kind.name, "anysplat", options)
-
-
-def _open_vggt(path: Path, kind: Kind, options: SystemOptions) -> System:
-    from bathyscope_train.systems.networks import open_published
-
-    return open_published(path, kind.name, "vggt", options)
+    assert kind.preset is not None
+    return open_published(path, kind.name, kind.preset, options)
 
 
 def _open_vda(path: Path, kind: Kind, options: SystemOptions) -> System:
@@ -125,23 +128,54 @@ def _open_endodav(path: Path, kind: Kind, options: SystemOptions) -> System:
     return open_endodav(path, kind.name, options)
 
 
+def _vda_video(path: Path, name: str) -> VideoNetwork:
+    from bathyscope_train.systems.video_networks import vda_network
+
+    return vda_network(path, name)
+
+
+def _endodac_video(path: Path, name: str) -> VideoNetwork:
+    from bathyscope_train.systems.video_networks import endodac_network
+
+    return endodac_network(path, name)
+
+
+def _endodav_video(path: Path, name: str) -> VideoNetwork:
+    from bathyscope_train.systems.video_networks import endodav_network
+
+    return endodav_network(path, name)
+
+
 def _vda(letter: str, width: int, licence: str) -> tuple[Kind, Kind]:
     file = f"video_depth_anything_vit{letter}.pth"
     recognises = _is_vda(width)
     return (
-        Kind(f"vda-{letter}", f"{file} of Video Depth Anything, {licence}", recognises, _open_vda),
-        Kind(f"vda-{letter}-metric", f"metric_{file} of Video Depth Anything, {licence}", recognises, _open_vda),
+        Kind(f"vda-{letter}", f"{file} of Video Depth Anything, {licence}", recognises, _open_vda, video=_vda_video),
+        Kind(
+            f"vda-{letter}-metric",
+            f"metric_{file} of Video Depth Anything, {licence}",
+            recognises,
+            _open_vda,
+            video=_vda_video,
+        ),
     )
 
 
 KINDS: tuple[Kind, ...] = (
-    Kind("anysplat", "model.safetensors of lhjiang/anysplat", _is_anysplat, _open_anysplat),
-    Kind("vggt", "model.safetensors of facebook/VGGT-1B", _is_vggt, _open_vggt),
+    Kind("anysplat", "model.safetensors of lhjiang/anysplat", _is_anysplat, _open_network, preset="anysplat"),
+    Kind("vggt", "model.safetensors of facebook/VGGT-1B", _is_vggt, _open_network, preset="vggt"),
     *_vda("s", 384, "Apache-2.0"),
     *_vda("b", 768, "CC-BY-NC-4.0"),
     *_vda("l", 1024, "CC-BY-NC-4.0"),
-    Kind("endodac", _ENDODAC_WEIGHTS, _is_endodac(768), _open_endodac, member=_DEPTH_FILE),
-    Kind("endodac-s", f"{_ENDODAC_WEIGHTS}, trained on ViT-S", _is_endodac(384), _open_endodac, member=_DEPTH_FILE),
-    Kind("endodav", f"{_DEPTH_FILE} of Zanue/EndoDAV", _is_endodav, _open_endodav, member=_DEPTH_FILE),
+    Kind("endodac", _ENDODAC_WEIGHTS, _is_endodac(768), _open_endodac, _DEPTH_FILE, video=_endodac_video),
+    Kind(
+        "endodac-s",
+        f"{_ENDODAC_WEIGHTS}, trained on ViT-S",
+        _is_endodac(384),
+        _open_endodac,
+        _DEPTH_FILE,
+        video=_endodac_video,
+    ),
+    Kind("endodav", f"{_DEPTH_FILE} of Zanue/EndoDAV", _is_endodav, _open_endodav, _DEPTH_FILE, video=_endodav_video),
 )
 """Every kind. Of two that read the same tensors the first is meant, unless the user or the file's name says more."""

@@ -80,7 +80,9 @@ class TorchModel:
     """Frames that the dense heads run on at once."""
 
     @torch.inference_mode()
-    def predict(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> WindowMaps:
+    def predict(
+        self, images: F32, checkpoint: Callable[[], None] = keep_going, *, focal: float | None = None
+    ) -> WindowMaps:
         """See :class:`~bathyscope.engines.WindowModel`."""
         network = self.network
         clip = torch.from_numpy(np.ascontiguousarray(images)).to(next(network.parameters()).device)[None]
@@ -91,7 +93,8 @@ class TorchModel:
             frames = slice(start, start + self.chunk)
             parts.append(network.dense(_of_frames(features, frames), clip[:, frames]))
         checkpoint()
-        solved = network.cameras(features, torch.cat([part.depth for part in parts], 1))
+        known = None if focal is None else clip.new_tensor([focal])
+        solved = network.cameras(features, torch.cat([part.depth for part in parts], 1), known)
         gaussians = [part.gaussians for part in parts if part.gaussians is not None]
         return WindowMaps(
             depth=_array(solved.depth[0]),

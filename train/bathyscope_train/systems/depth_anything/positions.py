@@ -18,16 +18,21 @@ def resized_positions(table: Float[Tensor, "1 p c"], grid: int, size: tuple[int,
     Args:
         table: Learnt table of a square grid, class token first.
         grid: Side of that grid.
-        size: Patches needed; the table is returned as it is for its own grid.
+        size: Patches needed; its own grid stays as it is. That is no branch here, so that a graph exports with both.
     """
     rows, columns = size
-    if rows == columns == grid:
-        return table
     square = table[:, 1:].float().unflatten(1, (grid, grid)).permute(0, 3, 1, 2)
-    down = _bicubic_by_factor(grid, rows, square)
-    across = _bicubic_by_factor(grid, columns, square)
+    own = (torch.full((), rows, device=square.device) == grid) & (torch.full((), columns, device=square.device) == grid)
+    down = torch.where(own, _unchanged(grid, rows, square), _bicubic_by_factor(grid, rows, square))
+    across = torch.where(own, _unchanged(grid, columns, square), _bicubic_by_factor(grid, columns, square))
     resized = (down @ square @ across.transpose(0, 1)).flatten(2).transpose(1, 2)
     return torch.cat((table[:, :1], resized.to(table.dtype)), dim=1)
+
+
+def _unchanged(source: int, target: int, like: Tensor) -> Float[Tensor, "target source"]:
+    """Weights that take every sample as it is: the identity, where both sizes are the same."""
+    same = torch.arange(target, device=like.device)[:, None] == torch.arange(source, device=like.device)
+    return same.to(like.dtype)
 
 
 def _bicubic_by_factor(source: int, target: int, like: Tensor) -> Float[Tensor, "target source"]:

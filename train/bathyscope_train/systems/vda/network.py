@@ -10,6 +10,8 @@ from bathyscope_train.systems.vda.settings import VdaSettings
 
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 """Of ImageNet, by which images are normalised."""
+_LEVEL1_A_PATCH = 4
+"""Pixels of level 1 along a side of a patch."""
 
 
 class VideoDepthAnything(nn.Module):
@@ -39,6 +41,18 @@ class VideoDepthAnything(nn.Module):
             GeometryError: If a side is not a multiple of the patch size, or a window is too long.
         """
         return self.on_normalised(normalised(images))
+
+    def mixed(self, frames: Float[Tensor, "t 3 h w"]) -> tuple[Tensor, Tensor, Tensor]:
+        """First stage of an exported network: all that :meth:`finish` reads of the frames of one window in [0, 1]."""
+        taps = self.pretrained(normalised(frames))
+        grid = self.pretrained.token_grid((frames.shape[-2], frames.shape[-1]))
+        return self.head.mixed(taps, grid, frames.shape[0])
+
+    def finish(self, path3: Tensor, level2: Tensor, level1: Tensor) -> Float[Tensor, "n h w"]:
+        """Second stage, which takes most memory and may run in chunks of frames."""
+        patch = self.settings.patch_size
+        rows, columns = (side // _LEVEL1_A_PATCH for side in level1.shape[-2:])
+        return self.head.finish(path3, level2, level1, (patch * rows, patch * columns))
 
     def on_normalised(self, images: Float[Tensor, "b t 3 h w"]) -> Float[Tensor, "b t h w"]:
         """The same for images that are normalised already."""

@@ -36,24 +36,42 @@ def open_vda(path: Path, name: str, options: SystemOptions) -> WindowedVideoSyst
     """
     refuse_options(name, options, takes=("input_size", "device"))
     network = load_vda(path, name)
-    letter = name.removeprefix("vda-").removesuffix(_METRIC)
     return vda_system(
         network.to(options.device),
         name=name,
-        metric=name.endswith(_METRIC),
+        metric=is_metric(name),
         input_size=options.input_size or INPUT_SIZE,
         sha256=hash_file(path).sha256,
-        licence="Apache-2.0" if letter == "s" else "CC-BY-NC-4.0",
+        licence=licence_of(name),
     )
 
 
 def load_vda(path: Path, name: str) -> VideoDepthAnything:
     """The network ``name`` with published weights, in evaluation mode."""
-    letter = name.removeprefix("vda-").removesuffix(_METRIC)
+    letter = _letter(name)
     weights = open_weights(path)
     network = VideoDepthAnything(SIZES[letter])
     load_exactly(network, weights, f"checkpoint of Video Depth Anything, ViT-{letter.upper()}")
     return network.eval()
+
+
+def is_metric(name: str) -> bool:
+    """Whether ``vda-s``, ``vda-s-metric`` ... stands for metric weights."""
+    return name.endswith(_METRIC)
+
+
+def licence_of(name: str) -> str:
+    """Licence of the published weights."""
+    return "Apache-2.0" if _letter(name) == "s" else "CC-BY-NC-4.0"
+
+
+def windows_of(network: VideoDepthAnything, *, metric: bool) -> KeyedWindows:
+    """The published windows; metric values are not rescaled from one to the next."""
+    return KeyedWindows(length=network.settings.frames, fit="none" if metric else "references")
+
+
+def _letter(name: str) -> str:
+    return name.removeprefix("vda-").removesuffix(_METRIC)
 
 
 def vda_system(
@@ -66,7 +84,7 @@ def vda_system(
     licence: str | None = None,
 ) -> WindowedVideoSystem:
     """A loaded network as a system; metric ones give depth in metres, relative ones disparity up to scale and shift."""
-    rule = KeyedWindows(length=network.settings.frames, fit="none" if metric else "references")
+    rule = windows_of(network, metric=metric)
     device = next(network.parameters()).device
 
     def prepare(image: NDArray[np.uint8]) -> F32:
