@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+from pydantic import ValidationError
 
 from bathyscope.engines import DepthOptions
 from bathyscope.errors import BathyscopeError, ServiceError, SettingsError
@@ -25,6 +26,18 @@ _WRONG_USAGE = 2
 _PATIENCE_S = 600.0
 
 
+def depth_options(stride: int, kind: DepthKind, max_frames: int | None, intrinsics: str | None) -> DepthOptions:
+    """What was asked for on the command line.
+
+    Raises:
+        typer.BadParameter: If the intrinsics are no camera.
+    """
+    try:
+        return DepthOptions(stride=stride, depth=kind, max_frames=max_frames, intrinsics=intrinsics)
+    except ValidationError as error:
+        raise typer.BadParameter(error.errors()[0]["msg"], param_hint="--intrinsics") from error
+
+
 @app.command()
 def depth(  # noqa: PLR0917 - typer: one parameter an option
     source: Annotated[
@@ -40,6 +53,9 @@ def depth(  # noqa: PLR0917 - typer: one parameter an option
     ] = None,
     stride: Annotated[int, typer.Option(min=1, help="Use every n-th frame.")] = 1,
     max_frames: Annotated[int | None, typer.Option(min=1, help="Stop after this many frames.")] = None,
+    intrinsics: Annotated[
+        str | None, typer.Option(help="The camera's fx,fy,cx,cy in pixels of the video, where they are known.")
+    ] = None,
     kind: Annotated[
         DepthKind,
         typer.Option(
@@ -58,7 +74,7 @@ def depth(  # noqa: PLR0917 - typer: one parameter an option
     """
     precision: Precision = dtype
     settings = BatchSettings(
-        options=DepthOptions(stride=stride, depth=kind, max_frames=max_frames), precision=precision, most_points=points
+        options=depth_options(stride, kind, max_frames, intrinsics), precision=precision, most_points=points
     )
     with ExitStack() as held:
         try:

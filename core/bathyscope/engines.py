@@ -7,6 +7,7 @@ video order, and after the last of them what they mean.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import entry_points
@@ -15,7 +16,7 @@ from typing import Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, PositiveInt
+from pydantic import BaseModel, PositiveInt, field_validator
 
 from bathyscope.bundle import Bundle
 from bathyscope.clip import FrameSequence
@@ -42,17 +43,43 @@ class DepthOptions(BaseModel, frozen=True, extra="forbid"):
     Gaussians has only the latter, and the result says so."""
     max_frames: PositiveInt | None = None
     """Stop after this many frames of the result."""
+    intrinsics: str | None = None
+    """The camera's ``fx,fy,cx,cy`` in pixels of the source, where they are known: used instead of an estimate."""
+
+    @field_validator("intrinsics")
+    @classmethod
+    def _four_numbers(cls, value: str | None) -> str | None:
+        if value is None:
+            return None
+        try:
+            fx, fy, cx, cy = (float(part) for part in value.split(","))
+        except ValueError:
+            raise ValueError(f"intrinsics are four numbers fx,fy,cx,cy in pixels, got {value!r}") from None
+        if not (0 < fx < math.inf and 0 < fy < math.inf and math.isfinite(cx) and math.isfinite(cy)):
+            raise ValueError(f"focal lengths must be positive and all four numbers finite, got {value!r}")
+        return value
+
+    @property
+    def known_intrinsics(self) -> NDArray[np.float64] | None:
+        """``intrinsics`` as a matrix (3, 3)."""
+        if self.intrinsics is None:
+            return None
+        fx, fy, cx, cy = (float(part) for part in self.intrinsics.split(","))
+        return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
 
 class WindowModel(Protocol):
     """A scene network that sees a window of frames at once."""
 
-    def predict(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> WindowMaps:
+    def predict(
+        self, images: F32, checkpoint: Callable[[], None] = keep_going, *, focal: float | None = None
+    ) -> WindowMaps:
         """Maps and pose encodings of frames (t, 3, h, w) in [0, 1]; safe to call from several threads.
 
         Args:
             images: h and w multiples of the network's patch.
             checkpoint: Called between the parts of the work; an exception from it ends the run.
+            focal: Focal length in pixels where it is known; a network that solves for motion makes use of it.
         """
         ...
 

@@ -5,7 +5,7 @@ The world is that of the window's first camera: pose 0 is the identity, and the 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +76,13 @@ class Scene:
 
     cameras: Cameras
     gaussians: Gaussians
+
+
+def with_focal(maps: WindowMaps, focal: float, focal_epsilon: float) -> WindowMaps:
+    """The maps with a known focal length, in their pixels, in place of the fields of view that were estimated."""
+    encoding = maps.pose_encoding.copy()
+    encoding[:, 7:9] = 2 * np.arctan(np.array(maps.size) / (2 * focal) - focal_epsilon)
+    return replace(maps, pose_encoding=encoding)
 
 
 def decode_cameras(pose_encoding: F32, size: Size, focal_epsilon: float) -> Cameras:

@@ -70,7 +70,9 @@ class OnnxModel:
     def __init__(self, bundle: Bundle, settings: EngineSettings) -> None:
         self._graphs = OnnxGraphs(bundle, settings)
 
-    def predict(self, images: F32, checkpoint: Callable[[], None] = keep_going) -> WindowMaps:
+    def predict(
+        self, images: F32, checkpoint: Callable[[], None] = keep_going, *, focal: float | None = None
+    ) -> WindowMaps:
         """See :class:`~bathyscope.engines.WindowModel`.
 
         Raises:
@@ -78,6 +80,7 @@ class OnnxModel:
             BundleError: If a graph fails on this input.
         """
         known: Tensors = {"images": np.ascontiguousarray(images, np.float32)}
+        known["focal"] = np.array([focal or 0.0], np.float32)
         known |= self._graphs.run("backbone", known)
         checkpoint()
         known |= self._graphs.heads(known, checkpoint)
@@ -88,7 +91,7 @@ class OnnxModel:
             raise GeometryError(f"the network's depth has shape {known['depth'].shape}, {(t, h, w)} was needed")
         gaussians = known.get("gaussians")
         return WindowMaps(
-            depth=np.asarray(known["depth"], np.float32),
+            depth=np.asarray(known.get("refined_depth", known["depth"]), np.float32),
             confidence=np.asarray(known["confidence"], np.float32),
             gaussians=None if gaussians is None else np.asarray(gaussians, np.float32),
             pose_encoding=np.asarray(known["pose_encoding"], np.float32),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,6 +11,7 @@ from bathyscope.engines import WindowModel
 from bathyscope.errors import SettingsError
 from bathyscope.model_spec import SceneSpec
 from bathyscope.result import DepthKind, FrameDepth, ResultMeta
+from bathyscope.scene import with_focal
 from bathyscope.vision.field_of_view import FieldOfView
 from bathyscope.vision.grid import Grid
 from bathyscope_serve.frames import FrameSource
@@ -40,13 +42,22 @@ class SceneSession(DepthSession):
     def _estimates(self, source: FrameSource, field_of_view: FieldOfView) -> Iterator[FrameDepth]:
         grid = Grid.fit(field_of_view, self._job.input)
         stitcher = Stitcher(self._job.input.overlap, self._job.settings.stitch)
+        known = self._job.options.known_intrinsics
         try:
             for small in self._stitched(source, grid, stitcher):
                 with self._timed("upsample"):
                     frame = _at_source_size(small, grid)
-                yield frame
+                yield frame if known is None else replace(frame, intrinsics=known)
         finally:
             self._warnings.extend(stitcher.warnings)
+
+    def _known_focal(self, grid: Grid) -> float | None:
+        """Focal length in pixels of the network, where the caller knows the camera; it has one for both axes."""
+        known = self._job.options.known_intrinsics
+        if known is None:
+            return None
+        small = grid.intrinsics_to_model(known)
+        return float(np.sqrt(small[0, 0] * small[1, 1]))
 
     def _stitched(self, source: FrameSource, grid: Grid, stitcher: Stitcher) -> Iterator[SmallDepth]:
         """Frames of the result at the network's size, as they become final."""
@@ -61,8 +72,11 @@ class SceneSession(DepthSession):
 
     def _depth(self, window: Window[SmallFrame], grid: Grid) -> list[SmallDepth]:
         images = np.stack([frame.image for frame in window.items])
+        focal = self._known_focal(grid)
         with self._timed("network"):
-            maps = self._model.predict(images, self._checkpoint)
+            maps = self._model.predict(images, self._checkpoint, focal=focal)
+        if focal is not None:
+            maps = with_focal(maps, focal, self._scene.focal_epsilon)
         with self._timed("splat"):
             views = render_window(
                 maps,

@@ -32,7 +32,13 @@ CONCAT = b"ffconcat version 1.0\nfile other.mp4\n"
 class SteadyModel(AnalyticModel):
     """Takes every window for the first frames of its plane, so that the same clip always has the same answer."""
 
-    def predict(self, images: NDArray[np.float32], checkpoint: Callable[[], None] = lambda: None) -> WindowMaps:
+    def predict(
+        self,
+        images: NDArray[np.float32],
+        checkpoint: Callable[[], None] = lambda: None,
+        *,
+        focal: float | None = None,
+    ) -> WindowMaps:
         self.windows.clear()
         greys = (GREY + np.arange(len(images), dtype=np.float32)) / 255
         return super().predict(np.broadcast_to(greys[:, None, None, None], images.shape), checkpoint)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from analytic_model import SPEC, AnalyticModel, focal, grey_clip, plane_depth, pose
+from analytic_model import SPEC, AnalyticModel, focal_lengths, grey_clip, plane_depth, pose
 from fake_engine import fake_bundle
 
 from bathyscope.bundle import Bundle
@@ -15,6 +15,7 @@ from bathyscope.clip import Clip
 from bathyscope.engines import DepthOptions, engine_factory
 from bathyscope.errors import ClipError, GeometryError
 from bathyscope.result import ClipDepth
+from bathyscope.scene import decode_cameras, with_focal
 from bathyscope_serve.engine import DepthEngine
 from bathyscope_serve.engine_settings import EngineSettings
 from bathyscope_serve.session import StoppedError
@@ -32,7 +33,7 @@ def analytic_engine(window: int = 6, overlap: int = 2) -> tuple[DepthEngine, Ana
 
 
 def source_intrinsics(size: tuple[int, int]) -> np.ndarray:
-    fx, fy = focal(size)
+    fx, fy = focal_lengths(size)
     return np.array([[fx, 0, size[1] / 2], [0, fy, size[0] / 2], [0, 0, 1]])
 
 
@@ -69,6 +70,30 @@ def test_rendered_depth_is_the_plane_too() -> None:
     assert result.meta.depth == "rendered"
     assert result.valid.all()
     assert_is_the_plane(result, tolerance=0.02)
+
+
+def test_known_intrinsics_reach_the_network_in_its_pixels_and_come_back_as_given() -> None:
+    """The picture of 90x120 is 42x56 for the network: both focal lengths shrink by 7 / 15."""
+    engine, model = analytic_engine()
+    fx, fy = focal_lengths((90, 120))
+    given = DepthOptions(intrinsics=f"{fx},{fy},61.5,44.0")
+    result = engine.depth_of(grey_clip(9), given)
+    assert model.focals == pytest.approx([np.sqrt(fx * fy) * 7 / 15] * len(model.focals))
+    np.testing.assert_allclose(result.intrinsics, np.broadcast_to(given.known_intrinsics, (9, 3, 3)))
+    assert result.valid.all()
+
+
+def test_a_known_focal_length_replaces_the_estimated_field_of_view() -> None:
+    maps = AnalyticModel().predict(np.full((2, 3, 42, 56), 60 / 255, np.float32))
+    known = with_focal(maps, 50.0, 0.0)
+    np.testing.assert_allclose(decode_cameras(known.pose_encoding, (42, 56), 0.0).intrinsics[:, 0, 0], 50, rtol=1e-5)
+    np.testing.assert_allclose(decode_cameras(known.pose_encoding, (42, 56), 0.0).intrinsics[:, 1, 1], 50, rtol=1e-5)
+
+
+@pytest.mark.parametrize("text", ["800", "800,800,320", "a,b,c,d", "0,800,320,240", "800,800,nan,240"])
+def test_intrinsics_that_are_no_camera_are_refused_in_words(text: str) -> None:
+    with pytest.raises(ValueError, match=r"fx,fy,cx,cy|positive"):
+        DepthOptions(intrinsics=text)
 
 
 def test_frames_come_out_while_the_clip_is_still_being_read() -> None:

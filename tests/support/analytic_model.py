@@ -36,7 +36,7 @@ def pose(index: int) -> NDArray[np.float64]:
     return moved
 
 
-def focal(size: tuple[int, int]) -> tuple[float, float]:
+def focal_lengths(size: tuple[int, int]) -> tuple[float, float]:
     """fx, fy of the network's image."""
     return size[1] / 2 / np.tan(FIELD_OF_VIEW[1] / 2), size[0] / 2 / np.tan(FIELD_OF_VIEW[0] / 2)
 
@@ -61,13 +61,21 @@ class AnalyticModel:
     def __init__(self) -> None:
         self.random = np.random.default_rng(3)
         self.windows: list[list[int]] = []
+        self.focals: list[float | None] = []
 
-    def predict(self, images: NDArray[np.float32], checkpoint: Callable[[], None] = lambda: None) -> WindowMaps:
+    def predict(
+        self,
+        images: NDArray[np.float32],
+        checkpoint: Callable[[], None] = lambda: None,
+        *,
+        focal: float | None = None,
+    ) -> WindowMaps:
         checkpoint()
+        self.focals.append(focal)
         indices = [round(float(image.max()) * 255) - GREY for image in images]
         self.windows.append(indices)
         size = (images.shape[2], images.shape[3])
-        fx, fy = focal(size)
+        fx, fy = focal_lengths(size)
         intrinsics = np.array([[fx, 0, size[1] / 2], [0, fy, size[0] / 2], [0, 0, 1]])
         scale = self.random.uniform(0.5, 2.0) if len(self.windows) > 1 else 1.0
         depth = scale * np.stack([plane_depth(index, intrinsics, size) for index in indices])

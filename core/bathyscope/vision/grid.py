@@ -73,6 +73,11 @@ class Grid:
         top, left, _, _ = self.field_of_view.box
         return crop_intrinsics(scale_intrinsics(intrinsics, self.size, self.crop_size), -left, -top)
 
+    def intrinsics_to_model(self, intrinsics: F64) -> F64:
+        """Pixel intrinsics (..., 3, 3) of the source for the network's image."""
+        top, left, _, _ = self.field_of_view.box
+        return scale_intrinsics(crop_intrinsics(intrinsics, left, top), self.crop_size, self.size)
+
     def to_source(self, values: F32, known: Mask) -> tuple[F32, Mask]:
         """A map (h, w) at source size, from its known pixels alone: nothing bleeds over their border.
 
