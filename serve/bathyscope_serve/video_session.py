@@ -42,13 +42,15 @@ class VideoSession(DepthSession):
         spec: What it is called, how it is fed and what its values mean.
 
     Raises:
-        SettingsError: If depth is asked for that the network cannot give.
+        SettingsError: If depth is asked for that the network cannot give, or intrinsics are given.
     """
 
     def __init__(self, job: Job, model: VideoModel, spec: ModelSpec) -> None:
         assert spec.video is not None
         if job.options.depth == "accumulated":
             raise SettingsError(f"{job.bundle.name} renders nothing that could be accumulated; ask for 'head' depth")
+        if job.options.intrinsics is not None:
+            raise SettingsError(f"{job.bundle.name} has no cameras; it makes no use of intrinsics")
         scale = _SCALES[spec.video.scale]
         super().__init__(job, ResultMeta(depth="head", outputs=spec.outputs, scale=scale))
         self._model, self._video = model, spec.video

@@ -48,7 +48,8 @@ class EngineSystem:
         Raises:
             ClipError: If the engine gives back fewer frames than went in.
         """
-        run = self.engine.run(frames, DepthOptions(depth=self.options.depth), name=frames.name)
+        known = _four_numbers(intrinsics) if self.info.cameras else None
+        run = self.engine.run(frames, DepthOptions(depth=self.options.depth, intrinsics=known), name=frames.name)
         count = 0
         with closing(run):
             for frame in run:
@@ -67,6 +68,13 @@ class EngineSystem:
             _log.warning("%s, %s: %s", self.info.name, frames.name, warning)
         if count != len(frames):
             raise ClipError(f"{frames.name}: {len(frames)} frames went in, {count} came back: {'; '.join(warnings)}")
+
+
+def _four_numbers(intrinsics: F64 | None) -> str | None:
+    """As the engine's options take them."""
+    if intrinsics is None:
+        return None
+    return ",".join(repr(float(intrinsics[place])) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
 
 
 def describe(spec: ModelSpec, name: str, digest: str, options: SystemOptions) -> SystemInfo:

@@ -14,6 +14,7 @@ from bathyscope_train.systems.endodac.network import DepthNetwork
 from bathyscope_train.systems.endodac.pose import IntrinsicsHead, PoseDecoder
 from bathyscope_train.systems.endodac.resnet import PairEncoder
 from bathyscope_train.systems.endodac.settings import DEPTH_SETTINGS, DepthSettings
+from bathyscope_train.systems.endodac.training import TrainingNetworks
 from bathyscope_train.systems.kinds import bare
 from bathyscope_train.systems.loading import load_exactly
 
@@ -117,3 +118,16 @@ def load_pose(folder: Path) -> PoseNetworks | None:
         load_exactly(intrinsics, open_weights(folder / INTRINSICS_FILE), "intrinsics head of EndoDAC")
         intrinsics.eval()
     return PoseNetworks(encoder.eval(), decoder.eval(), intrinsics)
+
+
+def load_training(folder: Path) -> TrainingNetworks:
+    """All networks beside depth from a folder of the public project, one file each; in evaluation mode.
+
+    Raises:
+        CheckpointError: If a file is missing or does not hold exactly its network. A folder without intrinsics head is
+            one of a training with known intrinsics.
+    """
+    networks = TrainingNetworks(learn_intrinsics=(folder / INTRINSICS_FILE).is_file())
+    for name, network in networks.named_children():
+        load_exactly(network, open_weights(folder / f"{name}.pth"), f"{name} network of EndoDAC")
+    return networks.eval()
