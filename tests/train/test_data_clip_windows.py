@@ -285,7 +285,7 @@ def test_a_frame_that_disappears_stops_training_with_its_name(tmp_path: Path) ->
     folder = write_frames(tmp_path / "a", pan([3 * k for k in range(4)]))
     windows = open_windows([ClipSource(folder=folder)], PLAIN)
     (folder / "002.png").unlink()
-    with WindowLoader(windows, workers=1) as loader, pytest.raises(DatasetError, match=r"002\.png: the frame is missing"):
+    with WindowLoader(windows, workers=1) as loader, pytest.raises(DatasetError, match=r"002\.png: the frame is miss"):
         next(loader)
 
 
@@ -304,3 +304,12 @@ def test_videos_beside_folders_of_our_own_are_used_too(tmp_path: Path) -> None:
     write_frames(tmp_path / "other" / "clip", pan([3 * k for k in range(6)]))
     write_video(tmp_path / "one.mp4", pan([2 * k for k in range(6)]))
     assert [s.name for s in open_sources([ClipSource(folder=tmp_path)]).sequences] == ["own", "one.mp4", "clip"]
+
+
+def test_a_folder_without_one_good_frame_is_named_with_its_first_reason(tmp_path: Path) -> None:
+    folder = write_frames(tmp_path / "a", pan([0, 3, 6]))
+    (tmp_path / "b").mkdir()
+    for path in folder.iterdir():
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 3])
+    with pytest.raises(DatasetError, match=r"none of its 3 frames can be read; first: .*000.png: the image is cut"):
+        open_windows([ClipSource(folder=folder)], PLAIN)

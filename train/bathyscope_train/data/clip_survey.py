@@ -110,8 +110,7 @@ def survey_clips(
 
 
 def _survey(sequence: DataSequence, settings: SurveySettings) -> ClipSurvey:
-    size = _usual_size(sequence)
-    view = _view(sequence, size)
+    size, view = _first_look(sequence)
     top, left, bottom, right = view.box
     grid = Grid.of(view, choose_size((bottom - top, right - left), 4, settings.pixels))
     walk = _Walk(grid, settings)
@@ -223,37 +222,37 @@ def _samples(sequence: DataSequence) -> Iterator[Image]:
             continue  # named in the pass over all frames
 
 
-def _usual_size(sequence: DataSequence) -> Size:
-    """The size that most of the sampled frames have."""
-    sizes = Counter((image.shape[0], image.shape[1]) for image in _samples(sequence))
-    if not sizes:
-        return _first_reason(sequence)
-    return sizes.most_common(1)[0][0]
+def _first_look(sequence: DataSequence) -> tuple[Size, FieldOfView]:
+    """The size that most of the sampled frames have, and the field of view of these."""
+    counts: Counter[Size] = Counter()
+    brightest: dict[Size, NDArray[np.uint8]] = {}
+    for image in _samples(sequence):
+        size, level = (image.shape[0], image.shape[1]), image.max(-1)
+        counts[size] += 1
+        brightest[size] = np.maximum(brightest[size], level) if size in brightest else level
+    if not counts:
+        image = _first_readable(sequence)
+        counts[image.shape[:2]], brightest[image.shape[:2]] = 1, image.max(-1)
+    usual = counts.most_common(1)[0][0]
+    inside = sequence.inside
+    if inside is not None and inside.shape == usual and inside.any():
+        return usual, FieldOfView(inside, "hull")
+    return usual, find_field_of_view(brightest[usual])
 
 
-def _first_reason(sequence: DataSequence) -> Size:
-    """Raise why frames cannot be read, or find one that can."""
+def _first_readable(sequence: DataSequence) -> Image:
+    """The first frame that can be read.
+
+    Raises:
+        DatasetError: If there is none; with the reason of the first.
+    """
     problem: DatasetError | None = None
     for index in range(len(sequence)):
         try:
-            image = sequence.frames.read(index)
+            return sequence.frames.read(index)
         except DatasetError as error:
             problem = problem or error
-        else:
-            return image.shape[0], image.shape[1]
     raise DatasetError(f"{sequence.name}: none of its {len(sequence)} frames can be read; first: {problem}")
-
-
-def _view(sequence: DataSequence, size: Size) -> FieldOfView:
-    if sequence.inside is not None and sequence.inside.shape == size and sequence.inside.any():
-        return FieldOfView(sequence.inside, "hull")
-    brightest: NDArray[np.uint8] | None = None
-    for image in _samples(sequence):
-        if image.shape[:2] == size:
-            level = image.max(-1)
-            brightest = level if brightest is None else np.maximum(brightest, level)
-    assert brightest is not None
-    return find_field_of_view(brightest)
 
 
 def _some(names: list[str]) -> str:
