@@ -25,6 +25,18 @@ def test_it_is_small_enough_to_ship() -> None:
     assert 4 * parameters < 40 * 2**20
 
 
+def test_the_small_preset_fits_into_forty_megabytes_of_half_precision_and_runs() -> None:
+    torch.manual_seed(0)
+    network = Network(get_preset("small")).eval()
+    parameters = sum(each.numel() for each in network.parameters())
+    assert 12e6 < parameters < 20e6
+    assert 2 * parameters < 40 * 2**20
+    with torch.no_grad():
+        prediction = network(clip(3, 42, 56))
+    assert prediction.maps.depth.shape == (1, 3, 42, 56)
+    assert bool(prediction.pose_encoding.isfinite().all())
+
+
 @pytest.mark.parametrize(
     ("frames", "height", "width"), [(1, 112, 140), (2, 14, 14), (5, 42, 126), (9, 70, 56)], ids=str
 )

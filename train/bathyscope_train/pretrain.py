@@ -102,7 +102,7 @@ class _Run:
         random = np.random.default_rng([settings.seed, step, self.rank])
         batch = self.draw_batch(progress, random)
         pairs = draw_pairs(settings.frames, settings.pairs, random)
-        given = draw_solver_input(random, certain=step < settings.true_focal_steps)
+        given = draw_solver_input(random, settings.frames, certain=step < settings.true_focal_steps)
         self.network.train()
         self.optimizer.zero_grad(set_to_none=True)
         objective = supervised_objective(
@@ -243,11 +243,16 @@ def draw_pairs(frames: int, count: int, random: np.random.Generator) -> ClipPair
     return ClipPairs(every.source[chosen], every.target[chosen], every.inside[chosen])
 
 
-def draw_solver_input(random: np.random.Generator, *, certain: bool) -> SolverInput:
-    """What the solver starts from: in half of the steps, and while ``certain``, the truth."""
+def draw_solver_input(random: np.random.Generator, frames: int, *, certain: bool) -> SolverInput:
+    """What the solver starts from (in half of the steps, and while ``certain``, the truth), and the frame left out."""
     focal, motion = random.random(2) < 0.5
     error = float(np.exp(random.normal(0, _FOCAL_ERROR)))
-    return SolverInput(true_focal=bool(certain or focal), focal_error=error, true_motion=bool(certain or motion))
+    return SolverInput(
+        true_focal=bool(certain or focal),
+        focal_error=error,
+        true_motion=bool(certain or motion),
+        held_out=int(random.integers(frames)),
+    )
 
 
 def use_bfloat16(precision: str) -> bool:

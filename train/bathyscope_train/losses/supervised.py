@@ -1,6 +1,6 @@
 """The objective of pre-training: all supervised terms of one batch, weighted."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from pydantic import BaseModel, NonNegativeFloat
@@ -10,10 +10,12 @@ from bathyscope_train.data.windows import Batch
 from bathyscope_train.losses.camera import focal_loss, induced_flow_loss, motion_loss
 from bathyscope_train.losses.depth import confidence_loss, gradient_loss, log_depth_loss, normal_loss, safe_log
 from bathyscope_train.losses.gaussian_targets import gaussian_loss
+from bathyscope_train.losses.held_out_view import held_out_view_loss
 from bathyscope_train.losses.matching import flow_loss, matching_cross_entropy, true_matches
 from bathyscope_train.model.matching_camera_head import MatchingCameraHead, image_diagonal
 from bathyscope_train.model.network import DenseMaps, Features, Network
 from bathyscope_train.model.trajectory import ClipPairs
+from bathyscope_train.render import CpuRenderer, GsplatRenderer, Renderer
 
 
 class LossWeights(BaseModel, frozen=True, extra="forbid"):
@@ -30,6 +32,7 @@ class LossWeights(BaseModel, frozen=True, extra="forbid"):
     induced_flow: NonNegativeFloat = 0.03
     corrected_depth: NonNegativeFloat = 0.5
     gaussians: NonNegativeFloat = 0.2
+    photometric: NonNegativeFloat = 0.0
 
 
 _CAMERA_TERMS = ("focal", "matching", "flow", "motion", "induced_flow", "corrected_depth")
@@ -52,6 +55,8 @@ class SolverInput:
     focal_error: float = 1.0
     true_motion: bool = False
     """Correct the depth under the true motions, rather than the estimated ones."""
+    held_out: int = 0
+    """Frame that the others' Gaussians have to show."""
 
 
 def supervised_objective(
@@ -73,6 +78,7 @@ def supervised_objective(
         given: What the solver starts from.
         autocast: Run the transformer in bfloat16; heads, solver and losses stay in float32.
     """
+    given = given or SolverInput()
     with torch.autocast(batch.images.device.type, dtype=torch.bfloat16, enabled=autocast):
         features = _in_float32(network.encode(batch.images))
     maps = network.dense(features, batch.images)
@@ -85,12 +91,16 @@ def supervised_objective(
         terms["normals"] = normal_loss(maps.depth, batch.depth, batch.valid, batch.focal)
     final = maps.depth.detach()
     if any(factors[name] > 0 for name in _CAMERA_TERMS):
-        more, final = _camera_terms(network, features, maps, batch, pairs=pairs, given=given or SolverInput())
+        more, final = _camera_terms(network, features, maps, batch, pairs=pairs, given=given)
         terms |= more
     error = (final.detach().log() - safe_log(batch.depth)).abs()
     terms["confidence"] = confidence_loss(maps.confidence, error, batch.valid)
     if maps.gaussians is not None:
         terms["gaussians"] = gaussian_loss(maps.gaussians, final.detach(), batch.depth, batch.valid, batch.focal)
+        if factors["photometric"] > 0:
+            terms["photometric"] = held_out_view_loss(
+                replace(maps, depth=final), batch, given.held_out, network.preset.scene, splatting(batch.images.device)
+            )
     total = torch.stack([factors[name] * term for name, term in terms.items()]).sum()
     return Objective(total, terms)
 
@@ -128,6 +138,11 @@ def _camera_terms(
         "corrected_depth": log_depth_loss(corrected, batch.depth, batch.valid)
         + 0.5 * gradient_loss(corrected, batch.depth, batch.valid),
     }, corrected
+
+
+def splatting(device: torch.device) -> Renderer:
+    """The differentiable splatter for tensors on a device."""
+    return GsplatRenderer() if device.type == "cuda" else CpuRenderer()
 
 
 def _in_float32(features: Features) -> Features:

@@ -149,9 +149,20 @@ _TINY = NetworkPreset(
     harmonic_degree=0,
 )
 
+_SMALL = NetworkPreset(
+    name="small",
+    stem=ConvStemSettings(channels=48),
+    aggregator=AggregatorSettings(width=320, depth=5, heads=5, registers=2, layer_scale=1.0, taps=(0, 2, 4)),
+    camera=MatchingCameraSettings(),
+    depth=LightHeadSettings(coarse=96, fine=24),
+    gaussians=LightHeadSettings(coarse=48, fine=16, blocks=1),
+    harmonic_degree=0,
+)
+
 PRESETS = MappingProxyType(
     {
         "tiny": _TINY,
+        "small": _SMALL,
         "anysplat": NetworkPreset(name="anysplat", scene=_ANYSPLAT_SCENE),
         "vggt": NetworkPreset(
             name="vggt", gaussians=None, scene=SceneSettings(pixel_center=0.0, activation="anysplat")

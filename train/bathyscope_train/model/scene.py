@@ -53,12 +53,10 @@ def assemble_scene(
         GeometryError: If the network has no Gaussian head.
     """
     maps = prediction.maps
-    if maps.gaussians is None:
-        raise GeometryError("a scene needs Gaussians; this network has no Gaussian head")
     size = (maps.depth.shape[-2], maps.depth.shape[-1])
     cameras = decode_cameras(prediction.pose_encoding, size, focal_epsilon=settings.focal_epsilon)
     world_from_camera = invert_rigid(cameras.camera_from_world)
-    gaussians = _gaussians(maps, images, world_from_camera, cameras.intrinsics, settings)
+    gaussians = world_gaussians(maps, images, world_from_camera, cameras.intrinsics, settings)
     if rebase:
         first = cameras.camera_from_world[:, 0]
         world_from_camera = _first_is_identity(first[:, None] @ world_from_camera)
@@ -66,14 +64,20 @@ def assemble_scene(
     return Scene(world_from_camera, cameras.intrinsics, gaussians)
 
 
-def _gaussians(
+def world_gaussians(
     maps: DenseMaps,
     images: Tensor,
     world_from_camera: Float[Tensor, "b t 4 4"],
     intrinsics: Float[Tensor, "b t 3 3"],
     settings: SceneSettings,
 ) -> GaussianBatch:
-    assert maps.gaussians is not None
+    """The Gaussians of all frames in the world of their cameras.
+
+    Raises:
+        GeometryError: If the network has no Gaussian head.
+    """
+    if maps.gaussians is None:
+        raise GeometryError("a scene needs Gaussians; this network has no Gaussian head")
     points = unproject(maps.depth, intrinsics, world_from_camera, pixel_center=settings.pixel_center).flatten(2, 3)
     raw = maps.gaussians.flatten(3).transpose(2, 3)
     features, confidence = raw[..., :-1], raw[..., -1]
