@@ -196,7 +196,7 @@ def _tilt(nx: float, ny: float, nz: float, gx: float, gy: float, gz: float, slop
 
 
 @jit
-def _beam(lamp: Lamp, camera: Array) -> tuple[float, float, float]:
+def beam_axis(lamp: Lamp, camera: Array) -> tuple[float, float, float]:
     """The beam's axis in the scene's frame."""
     ax, ay, az = lamp.axis
     return (
@@ -246,7 +246,7 @@ def shade(
     open_space = free_depth(surface, x + h * nx, y + h * ny, z + h * nz) / h
     open_space = CREST + (1 - CREST) * min(max(1.25 * open_space, 0.0), 1.0)
 
-    bx, by, bz = _beam(lamp, camera)
+    bx, by, bz = beam_axis(lamp, camera)
     direct, highlight, sheen = 0.0, 0.0, 0.0
     lights = lamp.offsets.shape[0]
     for k in range(lights):

@@ -5,7 +5,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bathyscope_train.data.synthetic.compiled import jit
-from bathyscope_train.data.synthetic.shading import Lamp
+from bathyscope_train.data.synthetic.shading import Lamp, beam_axis, soft_edge
 from bathyscope_train.data.synthetic.solid_tracing import local_normal, to_local, trace_solids
 from bathyscope_train.data.synthetic.solids import (
     BALL,
@@ -156,6 +156,7 @@ def shade_solid(
     vx, vy, vz = (camera[0, 3] - x) / distance, (camera[1, 3] - y) / distance, (camera[2, 3] - z) / distance
     direct, highlight = 0.0, 0.0
     lights = lamp.offsets.shape[0]
+    bx, by, bz = beam_axis(lamp, camera)
     if solids.lamp_share > 0:
         for k in range(lights):
             sx, sy, sz = lamp.offsets[k, 0], lamp.offsets[k, 1], lamp.offsets[k, 2]
@@ -164,8 +165,10 @@ def shade_solid(
             lz = camera[2, 0] * sx + camera[2, 1] * sy + camera[2, 2] * sz + camera[2, 3] - z
             reach = np.sqrt(lx * lx + ly * ly + lz * lz)
             lx, ly, lz = lx / reach, ly / reach, lz / reach
-            axis = max(-(camera[0, 2] * lx + camera[1, 2] * ly + camera[2, 2] * lz), 0.0)
+            axis = max(-(bx * lx + by * ly + bz * lz), 0.0)
             power = axis**lamp.spot * (20.0 / np.sqrt(reach * reach + lamp.soft_mm**2)) ** lamp.falloff / lights
+            if lamp.cone[1] >= -1.0:
+                power *= soft_edge(axis, lamp.cone)
             more, gloss = _add(solids, n, solids.lamp_share * power, lx, ly, lz, nx, ny, nz, vx, vy, vz)
             direct += more
             highlight += gloss

@@ -14,9 +14,12 @@ from torch import Tensor
 
 from bathyscope_train.data.synthetic.clip import ClipPlan, from_first_camera, plan_clip
 from bathyscope_train.data.synthetic.domain import Domain
-from bathyscope_train.data.synthetic.torch_optics import develop, views
+from bathyscope_train.data.synthetic.torch_formation import form_images, image_motion
+from bathyscope_train.data.synthetic.torch_metering import views
+from bathyscope_train.data.synthetic.torch_optics import develop
 from bathyscope_train.data.synthetic.torch_rendering import render_scenes
 from bathyscope_train.data.synthetic.torch_scene import scene_tensors
+from bathyscope_train.data.synthetic.torch_support import check_plans
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +31,13 @@ class ClipBatch:
     """Z-depth of the ray through each pixel's centre; 0 outside the field of view."""
     valid: Bool[Tensor, "b t h w"]
     """Inside the field of view, and the scene is there."""
+    moving: Bool[Tensor, "b t h w"]
+    """Instruments, whose motion is not the camera's."""
     world_from_camera: Float[Tensor, "b t 4 4"]
     """The first frame of each clip is the identity."""
     intrinsics: Float[Tensor, "b 3 3"]
+    distortion: Float[Tensor, "b 2"]
+    """k1 and k2 of each lens; see ``lens``."""
     names: tuple[str, ...]
 
 
@@ -74,8 +81,12 @@ def render_plans(
         device: Where to render.
         dtype: float32, or float64 to look for differences.
         generator: Source of the noise, on ``device``.
+
+    Raises:
+        SettingsError: If a plan has what this renderer has not.
     """
-    kinds = [plan.scene.surface.kind for plan in plans]
+    check_plans(plans)
+    kinds = [(plan.scene.surface.kind, _has_solids(plan)) for plan in plans]
     groups = [[index for index, kind in enumerate(kinds) if kind == wanted] for wanted in sorted(set(kinds))]
     parts = [_render([plans[index] for index in group], device, dtype, generator) for group in groups]
     order = torch.tensor(np.argsort(np.concatenate(groups)), device=parts[0].frames.device)
@@ -83,26 +94,44 @@ def render_plans(
         frames=torch.cat([part.frames for part in parts])[order],
         depth=torch.cat([part.depth for part in parts])[order],
         valid=torch.cat([part.valid for part in parts])[order],
+        moving=torch.cat([part.moving for part in parts])[order],
         world_from_camera=torch.cat([part.world_from_camera for part in parts])[order],
         intrinsics=torch.cat([part.intrinsics for part in parts])[order],
+        distortion=torch.cat([part.distortion for part in parts])[order],
         names=tuple(plan.name for plan in plans),
     )
+
+
+def _has_solids(plan: ClipPlan) -> bool:
+    return len(plan.scene.solids.kind) + len(plan.instruments.solids.kind) > 0
 
 
 def _render(
     plans: Sequence[ClipPlan], device: torch.device | str, dtype: torch.dtype, generator: torch.Generator | None
 ) -> ClipBatch:
-    """Clips whose scenes have one kind of surface."""
-    scene = scene_tensors(plans, device, dtype)
+    """Clips whose scenes have one kind of surface, and all solids or none."""
+    pictures = render_scenes(scene_tensors(plans, device, dtype), plans[0].size)
+    radiance, depth, mover = (values.unflatten(0, (len(plans), -1)) for values in pictures)
     sensors = [plan.sensor for plan in plans]
-    radiance, depth = render_scenes(scene, plans[0].size)
+    poses, intrinsics, distortion = (
+        torch.from_numpy(np.stack(values)).to(depth)
+        for values in zip(*((plan.scene_from_camera, plan.intrinsics, plan.distortion) for plan in plans), strict=True)
+    )
+
+    def motion(chosen: list[int]) -> Float[Tensor, "b t 2 h w"]:
+        return image_motion(depth[chosen], poses[chosen], intrinsics[chosen], distortion[chosen])
+
+    focal = [float(plan.intrinsics[0, 0]) for plan in plans]
+    formed = form_images(radiance, depth, motion, focal, sensors)
     valid = (views(sensors, depth)[:, 0] >= 0.5) & (depth > 0)
     world_from_camera = np.stack([from_first_camera(plan.scene_from_camera) for plan in plans])
     return ClipBatch(
-        frames=develop(radiance, sensors, generator),
+        frames=develop(formed, sensors, generator),
         depth=torch.where(valid, depth, 0.0),
         valid=valid,
+        moving=valid & (mover > 0),
         world_from_camera=torch.from_numpy(world_from_camera).to(depth),
-        intrinsics=scene.intrinsics,
+        intrinsics=intrinsics,
+        distortion=distortion,
         names=tuple(plan.name for plan in plans),
     )

@@ -35,18 +35,28 @@ def blur(images: Float[Tensor, "b ... h w"], sigmas: Sequence[float], *, border:
     """
     if max(sigmas) == 0:
         return images
-    matrices = (
-        torch.from_numpy(np.stack([blur_matrix(size, sigma, border) for sigma in sigmas])).to(images)
-        for size in images.shape[-2:]
-    )
-    return filter_images(images, *matrices)
+    height, width = images.shape[-2:]
+    rows, columns = ([blur_matrix(size, sigma, border) for sigma in sigmas] for size in (height, width))
+    return filter_images(images, stacked(rows, images), stacked(columns, images))
 
 
-def blur_matrix(size: int, sigma: float, border: str = "mirror") -> Array:
-    """The matrix ``(size, size)`` of a Gaussian blur along one axis, cut at four standard deviations as OpenCV does."""
+def stacked(matrices: Sequence[Array], like: Tensor) -> Float[Tensor, "b g h"]:
+    """Matrices of a batch, on the device of ``like``."""
+    return torch.from_numpy(np.stack(matrices)).to(like)
+
+
+def blur_matrix(size: int, sigma: float, border: str = "mirror", *, radius: int | None = None) -> Array:
+    """The matrix ``(size, size)`` of a Gaussian blur along one axis.
+
+    Args:
+        size: Samples.
+        sigma: Standard deviation in samples; 0 is no blur.
+        border: See :func:`blur`.
+        radius: Where it is cut; at four standard deviations, as OpenCV does, if not said.
+    """
     if sigma == 0:
         return np.eye(size)
-    radius = (round(sigma * 8 + 1) | 1) // 2
+    radius = (round(sigma * 8 + 1) | 1) // 2 if radius is None else radius
     taps = np.exp(-0.5 * (np.arange(-radius, radius + 1) / sigma) ** 2)
     matrix = np.zeros((size, size + 2 * radius))
     for row in range(size):
@@ -56,7 +66,7 @@ def blur_matrix(size: int, sigma: float, border: str = "mirror") -> Array:
     return folded
 
 
-def sampling_matrix(places: Array, size: int) -> Array:
+def sampling_matrix(places: npt.NDArray[np.floating], size: int) -> Array:
     """The matrix ``(n, size)`` of linear interpolation at ``places`` (0 is the first sample); the border repeats."""
     places = np.clip(places, 0, size - 1)
     low = np.minimum(places.astype(np.int64), max(size - 2, 0))
@@ -65,6 +75,14 @@ def sampling_matrix(places: Array, size: int) -> Array:
     matrix[every, low] = 1 - (places - low)
     matrix[every, np.minimum(low + 1, size - 1)] += places - low
     return matrix
+
+
+def mean_matrix(size: int, smaller: int) -> Array:
+    """The matrix ``(smaller, size)`` of means over equal parts of an axis."""
+    edges = np.arange(smaller + 1) * size / smaller
+    samples = np.arange(size)
+    cover = np.minimum(edges[1:, None], samples + 1) - np.maximum(edges[:-1, None], samples)
+    return np.asarray(np.clip(cover, 0, None) * smaller / size, np.float64)
 
 
 def _fold(index: npt.NDArray[np.int64], size: int, border: str) -> npt.NDArray[np.int64]:

@@ -1,16 +1,14 @@
-"""Tracing in torch: what ``tracing`` does a ray at a time, for the rays ``(s, n)`` of s scenes at once.
+"""Tracing in torch: what ``tracing`` does a ray at a time, for the rays ``(s, n)`` of s rows at once.
 
 Points and directions are ``(3, s, n)``. Both renderers take the same steps, so that they find the same surface.
 """
-
-from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from bathyscope_train.data.synthetic.scene import BLOCK, TUBE
-from bathyscope_train.data.synthetic.torch_compaction import State, repeat_in_rounds
+from bathyscope_train.data.synthetic.torch_layout import State, repeat_in_rounds
 from bathyscope_train.data.synthetic.torch_scene import SurfaceTensors
 from bathyscope_train.data.synthetic.tracing import CLOSE_MM, FARTHEST_MM, REFINEMENTS
 
@@ -23,17 +21,37 @@ Values = Float[Tensor, "s n"]
 
 def place(surface: SurfaceTensors, points: Points) -> tuple[Values, Values, Values]:
     """Row, column and reach of points; reach is the radius in a tube and the depth over a field."""
-    x, y, z = points
     if surface.kind != TUBE:
+        x, y, z = points
         return (y - surface.first[0]) * surface.density[0], (x - surface.first[1]) * surface.density[1], z
+    row, dx, dy = _out(surface, points)
+    a = dy / (dx.abs() + dy.abs() + 1e-12)
+    a = torch.where(dx < 0, 2 - a, torch.where(dy < 0, 4 + a, a))
+    return row, a * surface.density[1], torch.sqrt(dx * dx + dy * dy)
+
+
+def _out(surface: SurfaceTensors, points: Points) -> tuple[Values, Values, Values]:
+    """Row of points in a tube, and the way to them from its centreline, x and y."""
+    x, y, z = points
     row = (z - surface.first[0]) * surface.density[0]
     i = torch.minimum(row.long().clamp_min(0), surface.centre.rows - 1)
     segment = surface.centre.at(i, torch.zeros_like(i))
     middle = torch.lerp(segment[..., :2], segment[..., 2:], (row - i).clamp(0, 1)[..., None])
-    dx, dy = x - middle[..., 0], y - middle[..., 1]
-    a = dy / (dx.abs() + dy.abs() + 1e-12)
-    a = torch.where(dx < 0, 2 - a, torch.where(dy < 0, 4 + a, a))
-    return row, a * surface.density[1], torch.sqrt(dx * dx + dy * dy)
+    return row, x - middle[..., 0], y - middle[..., 1]
+
+
+def at_rest(surface: SurfaceTensors, points: Points) -> Points:
+    """Where points of swollen tissue are while it rests."""
+    if surface.waves is None:
+        return points
+    x, y, z = points
+    amplitude, k_along, k_across, phase = surface.waves
+    if surface.kind != TUBE:
+        return torch.stack([x, y, z - (amplitude * torch.cos(k_along * y + k_across * x + phase)).sum(0)])
+    _, dx, dy = _out(surface, points)
+    gain = (amplitude * torch.cos(k_along * z + k_across * torch.atan2(dy, dx) + phase)).sum(0)
+    share = gain / torch.sqrt(dx * dx + dy * dy).clamp_min(1e-9)
+    return torch.stack([x - share * dx, y - share * dy, z])
 
 
 def free_depth(surface: SurfaceTensors, points: Points) -> Values:
@@ -63,8 +81,8 @@ def trace(surface: SurfaceTensors, start: Values, origin: Points, direction: Poi
     free = free_depth(surface, origin + start * direction)
     before = surface.stride_mm.expand_as(start)
     state: State = (torch.zeros_like(start), start, before, free, torch.zeros_like(start))
-    near, far, before, free, _ = repeat_in_rounds(partial(_march, surface), _in_the_open, fixed, state, _MARCH)
-    near, far, _, _ = repeat_in_rounds(partial(_refine, surface), _apart, fixed, (near, far, before, free), _REFINE)
+    near, far, before, free, _ = repeat_in_rounds(_march, _in_the_open, surface, fixed, state, rounds=_MARCH)
+    near, far, _, _ = repeat_in_rounds(_refine, _apart, surface, fixed, (near, far, before, free), rounds=_REFINE)
     return 0.5 * (near + far)
 
 
@@ -89,7 +107,7 @@ def _march(surface: SurfaceTensors, fixed: State, state: State, _: int) -> State
         j = torch.zeros_like(i)
     else:
         j = torch.minimum((column.long() // BLOCK).clamp_min(0), surface.core.columns - 1)
-    core = surface.core.at(i, j)[..., 0] - reach
+    core = surface.core.at(i, j)[..., 0] - surface.rise_mm - reach
     return (
         torch.where(active, t, near),
         torch.where(active, ahead, t),
