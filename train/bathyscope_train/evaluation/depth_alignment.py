@@ -69,7 +69,7 @@ def fit_alignment(kind: AlignmentKind, pieces: PixelPieces) -> Alignment:
 
 
 def _scale(pieces: PixelPieces) -> Alignment:
-    true, predicted = _medians(pieces)
+    true, predicted = _medians(pieces, deviation=False)
     ratio = true.median() / predicted.median() if predicted.median() > 0 else float("nan")
     if not (np.isfinite(ratio) and ratio > 0):
         raise GeometryError(f"median scaling needs positive depth, got medians {true.median()}, {predicted.median()}")
@@ -77,7 +77,7 @@ def _scale(pieces: PixelPieces) -> Alignment:
 
 
 def _scale_shift(pieces: PixelPieces) -> Alignment:
-    true, predicted = _medians(pieces)
+    true, predicted = _medians(pieces, deviation=True)
     spread = predicted.mean_absolute_deviation()
     if not (np.isfinite(spread) and spread > 0):
         raise GeometryError("scale and shift need predicted depth that is finite and differs; use scale alone")
@@ -99,9 +99,9 @@ def _affine_disparity(pieces: PixelPieces) -> Alignment:
     return Alignment(scale=scale, shift=(sum_y - scale * sum_x) / n, of_disparity=True)
 
 
-def _medians(pieces: PixelPieces) -> tuple[StreamingMedian, StreamingMedian]:
+def _medians(pieces: PixelPieces, *, deviation: bool) -> tuple[StreamingMedian, StreamingMedian]:
     """Of truth and prediction, in two passes over both."""
-    true, predicted = StreamingMedian(), StreamingMedian()
+    true, predicted = StreamingMedian(deviation=deviation), StreamingMedian(deviation=deviation)
     for g, p in pieces():
         true.coarse(g)
         predicted.coarse(p)

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bathyscope.camera import F64, Size
+from bathyscope_train.evaluation.warp_kernel import disagreement, scatter
 
 F32 = NDArray[np.float32]
 _WITHIN = 1.25
-_IN_FRONT = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,41 +84,24 @@ def temporal_error(a: View, b: View, warping: Warping = Warping()) -> TemporalEr
 
 def warp(source: View, target: View, warping: Warping = Warping()) -> F64:
     """Depth of ``source`` as camera ``target`` sees it: (h, w), 0 where no point lands."""
-    h, w = source.depth.shape
-    rows, columns = np.nonzero(source.mask)
-    d = np.asarray(source.depth[rows, columns], np.float64)
-    lifted = np.stack([(columns + warping.centre) * d, (rows + warping.centre) * d, d])
     motion = target.camera_from_world @ np.linalg.inv(source.camera_from_world)
     turn = target.intrinsics @ motion[:3, :3] @ np.linalg.inv(source.intrinsics)
-    x, y, z = turn @ lifted + (target.intrinsics @ motion[:3, 3])[:, None]
-    ahead = z > _IN_FRONT
-    z = z[ahead]
-    u, v = x[ahead] / z, y[ahead] / z
-    if warping.rounded:
-        u, v = np.rint(u), np.rint(v)
-    else:
-        u, v = np.floor(u + 0.5 - warping.centre), np.floor(v + 0.5 - warping.centre)
-    inside = (u >= 0) & (u < w) & (v >= 0) & (v < h)
-    place = v[inside].astype(np.intp) * w + u[inside].astype(np.intp)
-    return _written(place, z[inside], (h, w), warping.nearest_wins)
-
-
-def _written(place: NDArray[np.intp], z: F64, size: Size, nearest_wins: bool) -> F64:
-    if nearest_wins:
-        nearest = np.full(size[0] * size[1], np.inf)
-        np.minimum.at(nearest, place, z)
-        return np.where(np.isfinite(nearest), nearest, 0.0).reshape(size)
-    last = np.zeros(size[0] * size[1])
-    last[place] = z
-    return last.reshape(size)
+    landed = np.zeros(source.depth.shape)
+    scatter(
+        np.ascontiguousarray(source.depth, np.float64),
+        np.ascontiguousarray(source.mask),
+        np.ascontiguousarray(turn, np.float64),
+        np.ascontiguousarray(target.intrinsics @ motion[:3, 3], np.float64),
+        warping.centre,
+        warping.rounded,
+        warping.nearest_wins,
+        landed,
+    )
+    return landed
 
 
 def _one_way(source: View, target: View, warping: Warping) -> tuple[float, float]:
     landed = warp(source, target, warping)
-    keep = target.mask & (landed > _IN_FRONT)
-    if not keep.any():
-        return float("nan"), float("nan")
-    expected, observed = landed[keep], np.asarray(target.depth, np.float64)[keep]
-    relative = np.abs(observed - expected) / observed
-    ratio = np.maximum(observed / expected, expected / observed)
-    return float(relative.mean()), float((ratio < _WITHIN).mean())
+    depth, mask = np.ascontiguousarray(target.depth, np.float64), np.ascontiguousarray(target.mask)
+    total, agree, count = disagreement(landed, depth, mask, _WITHIN)
+    return (total / count, agree / count) if count else (float("nan"), float("nan"))
