@@ -141,6 +141,13 @@ def test_the_corners_lose_what_the_vignette_says() -> None:
     assert frame[0, 0, 0] / frame[50, 50, 0] == pytest.approx(0.6, abs=0.02)
 
 
+def test_named_domains_carry_their_names_and_the_first_is_what_ranges_default_to() -> None:
+    assert [domain.name for domain in DOMAINS.values()] == list(DOMAINS)
+    assert DOMAINS["source"] == Domain(name="source")
+    with pytest.raises(KeyError, match="sunny"):
+        DOMAINS["sunny"]
+
+
 def test_a_domain_survives_its_file(tmp_path: Path) -> None:
     path = tmp_path / "broad.json"
     path.write_text(DOMAINS["broad"].model_dump_json(), encoding="utf-8")
