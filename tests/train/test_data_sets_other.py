@@ -176,11 +176,33 @@ def blue(image: np.ndarray) -> int:
     return round((float(image[..., 2].mean()) - 40) / 8)
 
 
-def test_frames_of_a_video_can_be_read_in_any_order(tmp_path: Path) -> None:
-    path = write_video(tmp_path / "a.mp4", [trees.picture(i % 20) for i in range(100)])
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels"),
+    [
+        ("a.mp4", "libx264", "yuv420p"),
+        ("a.mkv", "libx264", "yuv420p"),
+        ("a.avi", "libx264", "yuv420p"),
+        ("b.avi", "mjpeg", "yuvj420p"),
+    ],
+)
+def test_frames_of_a_video_can_be_read_in_any_order(tmp_path: Path, name: str, codec: str, pixels: str) -> None:
+    path = write_video(tmp_path / name, [trees.picture(i % 20) for i in range(100)], codec=codec, pixels=pixels)
     video = VideoFrames(path)
     assert (len(video), video.size) == (100, trees.SIZE)
     assert [blue(video.read(i)) for i in (0, 99, 3, 4, 70, 69, 5)] == [i % 20 for i in (0, 99, 3, 4, 70, 69, 5)]
+
+
+def test_a_damaged_place_in_a_video_is_named_and_the_rest_can_be_read(tmp_path: Path) -> None:
+    path = write_video(tmp_path / "a.avi", [trees.picture(i) for i in range(12)], codec="mjpeg", pixels="yuvj420p")
+    good = VideoFrames(path)
+    good.read(11)
+    with pytest.raises(DatasetError, match="frame 12 of 12"):
+        good.read(12)
+    data = bytearray(path.read_bytes())
+    (tmp_path / "cut.avi").write_bytes(data[: len(data) // 2])
+    cut = VideoFrames(tmp_path / "cut.avi")
+    assert blue(cut.read(2)) == 2
+    assert len(cut) < 12
 
 
 def test_a_folder_of_videos_and_of_frames_is_found_however_deep(tmp_path: Path) -> None:

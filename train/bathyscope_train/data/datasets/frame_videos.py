@@ -24,13 +24,17 @@ class _Table:
     """What demuxing alone tells of a video."""
 
     times: tuple[int, ...]
-    """Presentation time of each frame, in units of the stream."""
+    """Presentation time of each frame, in units of the stream; its number where the file has no usable times."""
     size: Size
+    untimed: bool
+    """Frames can only be counted from the first: AVI, and files without time stamps."""
 
 
 @dataclass(eq=False)
 class VideoFrames:
     """The frames of a video. Reading in order decodes each once; a jump begins at the key frame before it.
+
+    Where times cannot be trusted (AVI), frames are counted, and a jump back begins at the first frame.
 
     Args:
         path: The file.
@@ -63,20 +67,33 @@ class VideoFrames:
         """
         if not 0 <= index < len(self):
             raise DatasetError(f"{self.path}: frame {index} of {len(self)}")
+        frame = self._counted(index) if self._table.untimed else self._timed(index)
+        if frame is None:
+            self._decoder = None
+            raise DatasetError(f"{self.where(index)}: it cannot be decoded; the file is damaged there")
+        self._next = index + 1
+        image: Image = frame.to_ndarray(format="rgb24")
+        return image[: image.shape[0] // 2] if self.upper_half else image
+
+    def _timed(self, index: int) -> Any:
+        """The frame of this number by its time; ``None`` if it does not come."""
         wanted = self._table.times[index]
         if self._decoder is None or not 0 <= index - self._next <= _LONGEST_WALK:
             self._decoder = self._decode_from(wanted)
         for frame in self._decoder:
-            if frame.pts >= wanted:
-                self._next = index + 1
-                if frame.pts == wanted:
-                    image: Image = frame.to_ndarray(format="rgb24")
-                    return image[: image.shape[0] // 2] if self.upper_half else image
-                self._decoder = None
-                break
-        else:
-            self._decoder = None
-        raise DatasetError(f"{self.where(index)}: it cannot be decoded; the file is damaged there")
+            if frame.pts is not None and frame.pts >= wanted:
+                return frame if frame.pts == wanted else None
+        return None
+
+    def _counted(self, index: int) -> Any:
+        """The frame of this number, counted from the first; ``None`` if there are not so many."""
+        if self._decoder is None or index < self._next:
+            self._decoder, self._next = self._decode_from(None), 0
+        for frame in self._decoder:
+            self._next += 1
+            if self._next == index + 1:
+                return frame
+        return None
 
     @cached_property
     def _table(self) -> _Table:
@@ -91,27 +108,24 @@ class VideoFrames:
             size = stream.height, stream.width
         if not times or 0 in size:
             raise DatasetError(f"{self.path}: the video holds no frames")
-        if None in times or len(set(times)) < len(times):
-            raise DatasetError(
-                f"{self.path}: frames without time stamps of their own; convert the video to mp4 (ffmpeg -i IN OUT.mp4)"
-            )
-        return _Table(tuple(sorted(times)), size)
+        untimed = container.format.name == "avi" or None in times or len(set(times)) < len(times)
+        return _Table(tuple(range(len(times)) if untimed else sorted(times)), size, untimed)
 
-    def _decode_from(self, time: int) -> Iterator[Any]:
-        """Frames from the key frame before ``time`` on; damaged ones are passed over."""
+    def _decode_from(self, time: int | None) -> Iterator[Any]:
+        """Frames from the key frame before ``time`` on, or all of them; damaged ones are passed over."""
         import av
 
         with self.path.open("rb") as file, _opened(self.path, file) as container:
             stream = _pictures(self.path, container)
             stream.codec_context.thread_count = 1
-            if time > self._table.times[0]:
+            if time is not None and time > self._table.times[0]:
                 container.seek(time, stream=stream, backward=True)
             for packet in container.demux(stream):
                 try:
                     decoded = packet.decode()
                 except av.FFmpegError:
                     continue
-                yield from (frame for frame in decoded if frame.pts is not None)
+                yield from decoded
 
     def files(self) -> tuple[Path, ...]:
         """The video."""

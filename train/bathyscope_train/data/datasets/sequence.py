@@ -54,7 +54,7 @@ class DepthReader(Protocol):
         ...
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class DataSequence:
     """A video; implements :class:`~bathyscope_train.evaluation.sequences.EvaluationSequence` and ``FrameSequence``."""
 
