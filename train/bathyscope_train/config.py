@@ -24,7 +24,7 @@ class PretrainSettings(BaseModel, frozen=True, extra="forbid"):
 
     preset: str = "tiny"
     data: tuple[SourceSettings, ...] = Field(min_length=1)
-    validation: tuple[Path, ...] = Field(default=(), description="Folders of held-out clips.")
+    validation: tuple[Path, ...] = Field(default=(), description="Folders of held-out clips, rendered or measured.")
     validation_clips: PositiveInt = Field(default=8, description="Clips taken from each validation folder.")
     out: Path
     initial: Path | None = Field(default=None, description="Checkpoint (safetensors) to start from.")

@@ -13,6 +13,8 @@ from torch import Tensor, nn
 
 from bathyscope.errors import SettingsError
 from bathyscope_train.config import PretrainSettings
+from bathyscope_train.curves import draw_curves
+from bathyscope_train.data.measured_clips import read_measured_clips
 from bathyscope_train.data.truth_clips import read_truth_clips
 from bathyscope_train.data.windows import Batch, TruthClip, sample_window, stack
 from bathyscope_train.losses.supervised import SolverInput, supervised_objective
@@ -39,7 +41,7 @@ def pretrain(settings: PretrainSettings) -> Path:
     """Train, or go on with the run in ``settings.out``; returns the path of the weights (their running average).
 
     The folder gets ``model.safetensors``, ``state.pt`` (to go on), ``metrics.jsonl``, ``settings.json`` and, at every
-    validation, ``validation.png``.
+    validation, ``validation.png`` and ``curves.png``.
 
     Raises:
         SettingsError: If the preset cannot be trained this way.
@@ -68,7 +70,7 @@ class _Run:
         self.optimizer = torch.optim.AdamW(parameter_groups(self.network, settings), betas=(0.9, 0.98))
         self.position = read_state(settings.out, self.network, self.average, self.optimizer)
         self.sources: dict[Path, list[TruthClip]] = {}
-        self.held_out = [read_truth_clips(path, limit=settings.validation_clips) for path in settings.validation]
+        self.held_out = [held_out_clips(path, settings.validation_clips) for path in settings.validation]
         self.started = time.monotonic() - self.position.elapsed_s
         self.recent: list[Tensor] = []
 
@@ -164,6 +166,7 @@ class _Run:
             _log.info("step %d, %s: %s", self.position.step, folder.name, summary(result))
             examples += pictures[:6]
         write_grid(self.settings.out / "validation.png", examples)
+        draw_curves(self.settings.out / METRICS_FILE, self.settings.out / "curves.png")
 
     def averaged(self) -> Network:
         """The network with the running average of the weights."""
@@ -198,6 +201,13 @@ def initial_network(settings: PretrainSettings) -> Network:
             f"preset {network.preset.name!r} has no matching camera head; pre-training needs one, as in 'tiny'"
         )
     return network
+
+
+def held_out_clips(folder: Path, count: int) -> list[TruthClip]:
+    """Clips of a validation folder: rendered ones, or those of a measured data set folder."""
+    if (folder / "frames").is_dir():
+        return read_measured_clips(folder, limit=count)
+    return read_truth_clips(folder, limit=count)
 
 
 def training_record(settings: PretrainSettings) -> dict[str, Any]:

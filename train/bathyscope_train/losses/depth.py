@@ -59,7 +59,8 @@ def surface_normals(depth: Float[Tensor, "b t h w"], focal: Float[Tensor, "b"]) 
     across = points[..., 1:-1, 2:, :] - points[..., 1:-1, :-2, :]
     along = points[..., 2:, 1:-1, :] - points[..., :-2, 1:-1, :]
     normal = torch.linalg.cross(across, along)
-    return normal / (normal.square().sum(-1, keepdim=True) + 1e-20).sqrt()
+    unit: Tensor = normal / (normal.square().sum(-1, keepdim=True) + 1e-20).sqrt()
+    return unit
 
 
 def confidence_loss(
