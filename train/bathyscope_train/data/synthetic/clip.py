@@ -108,8 +108,24 @@ def draw_scene(seed: int, domain: Domain) -> Scene:
     return build(random, settle_palette(random, domain.material))
 
 
-def plan_clip(seed: int, domain: Domain, *, frames: int = 16, size: tuple[int, int] = (112, 140)) -> ClipPlan:
+def plan_clip(
+    seed: int,
+    domain: Domain,
+    *,
+    frames: int = 16,
+    size: tuple[int, int] = (112, 140),
+    take: int = 0,
+    scene: Scene | None = None,
+) -> ClipPlan:
     """Draw everything about a clip but its noise; the same for the same arguments.
+
+    Args:
+        seed: Number of the clip, at least 0.
+        domain: What scenes, light, camera and sensor may look like.
+        frames: Length.
+        size: Height and width in pixels.
+        take: Which of the clips in this scene: each has another camera, light and sensor; 0 is ``render_clip``'s.
+        scene: The seed's scene, where it is known already.
 
     Raises:
         SettingsError: If seed, length or size cannot be used.
@@ -118,28 +134,29 @@ def plan_clip(seed: int, domain: Domain, *, frames: int = 16, size: tuple[int, i
         raise SettingsError(
             f"a clip needs a seed >= 0, at least 1 frame and 8 x 8 pixels; got seed {seed}, {frames} frames, {size}"
         )
-    scene = draw_scene(seed, domain)
-    random = _stream(seed, domain, "camera")
+    scene = draw_scene(seed, domain) if scene is None else scene
+    stream = partial(_stream, seed, domain, take=take)
+    random = stream("camera")
     fov_deg = _view_angle(random, domain.camera.fov_deg)
-    poses = camera_path(random, _stream(seed, domain, "hand"), scene, domain.camera, fov_deg, frames)
+    poses = camera_path(random, stream("hand"), scene, domain.camera, fov_deg, frames)
     intrinsics = _intrinsics(fov_deg, size)
     reach = float(np.hypot(*size)) / 2 / intrinsics[0, 0]
-    random = _stream(seed, domain, "life")
+    random = stream("life")
     instruments = NO_INSTRUMENTS
     if random.uniform() < domain.life.instruments and scene.surface.kind != NOTHING:
         slopes = intrinsics[0, 2] / intrinsics[0, 0], intrinsics[1, 2] / intrinsics[1, 1]
         instruments = draw_instruments(random, poses, slopes, partial(_depth_along, scene, poses[0]))
-    swell = draw_swell(_stream(seed, domain, "swell"), domain.life, scene.surface)
-    random = _stream(seed, domain, "light")
+    swell = draw_swell(stream("swell"), domain.life, scene.surface)
+    random = stream("light")
     return ClipPlan(
         scene=scene,
         lamp=draw_lamp(random, domain.light, soft_mm=1.5 * scene.surface.feature_mm),
-        sensor=draw_sensor(random, domain.sensor, size, draw_haze(_stream(seed, domain, "air"), domain.air)),
+        sensor=draw_sensor(random, domain.sensor, size, draw_haze(stream("air"), domain.air)),
         scene_from_camera=poses,
         intrinsics=intrinsics,
         size=size,
-        name=f"{domain.name}-{scene.family}-{seed:06d}",
-        distortion=draw_distortion(_stream(seed, domain, "lens"), domain.camera, reach),
+        name=f"{domain.name}-{scene.family}-{seed:06d}" + (f".{take}" if take else ""),
+        distortion=draw_distortion(stream("lens"), domain.camera, reach),
         instruments=instruments,
         swell=swell,
     )
@@ -213,9 +230,10 @@ def from_first_camera(scene_from_camera: npt.NDArray[np.float64]) -> npt.NDArray
     return world_from_camera
 
 
-def _stream(seed: int, domain: Domain, what: str) -> np.random.Generator:
+def _stream(seed: int, domain: Domain, what: str, *, take: int = 0) -> np.random.Generator:
     """Independent random numbers for each part of a clip, so that one part can change alone."""
-    return np.random.default_rng([seed, crc32(domain.name.encode()), crc32(what.encode())])
+    numbers = [seed, crc32(domain.name.encode()), crc32(what.encode())]
+    return np.random.default_rng([*numbers, take] if take else numbers)
 
 
 def _view_angle(random: np.random.Generator, bounds: tuple[float, float]) -> float:
