@@ -10,15 +10,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from bathyscope_train.losses.photometric import (
-    grid_coordinates,
-    masked_average,
-    photometric_error,
-    reproject,
-    sample,
-    structural_dissimilarity,
-    warp_by_depth,
-)
+from bathyscope_train.losses.corner_warping import grid_coordinates, reproject, sample, warp_by_depth
+from bathyscope_train.losses.resemblance import masked_average, photometric_error, structural_dissimilarity
 from bathyscope_train.losses.smoothness import appearance_smoothness, disparity_smoothness
 from bathyscope_train.model.unprojection import invert_rigid
 from bathyscope_train.systems.endodac.pose import motion_matrix

@@ -7,16 +7,11 @@ import torch
 from torch import Tensor
 
 from bathyscope.errors import GeometryError
+from bathyscope_train.losses.corner_warping import reproject, warp_by_depth, warp_by_flow
 from bathyscope_train.losses.endodac import SourceView, depth_objective, flow_objective, refined_target
 from bathyscope_train.losses.endodav import depth_flow_loss, depth_reprojection_loss
 from bathyscope_train.losses.occlusion import splat_ones, visibility_mask
-from bathyscope_train.losses.photometric import (
-    masked_average,
-    photometric_error,
-    reproject,
-    warp_by_depth,
-    warp_by_flow,
-)
+from bathyscope_train.losses.resemblance import masked_average, photometric_error
 from bathyscope_train.losses.smoothness import appearance_smoothness, disparity_smoothness, edge_aware_smoothness
 
 SIZE = (12, 16)
@@ -113,13 +108,13 @@ def test_appearance_is_smooth_only_inside_the_mask() -> None:
 def view(target: Tensor, *, appearance: Tensor | None = None) -> SourceView:
     """A source that both warps bring onto the target exactly."""
     change = torch.zeros_like(target) if appearance is None else appearance
-    return SourceView(target, flow_of(0.0, 0.0), torch.ones(1, 1, *SIZE), change, target)
+    return SourceView(target, flow_of(0.0, 0.0), torch.ones(1, 1, *SIZE), change)
 
 
 def test_what_is_explained_completely_costs_nothing() -> None:
     target, flat = picture(), torch.full((1, 1, *SIZE), 0.3)
     assert flow_objective(target, [view(target), view(target)], scale=0).abs() < 1e-6
-    assert depth_objective(target, flat, [view(target)], scale=0).abs() < 1e-6
+    assert depth_objective(target, flat, [view(target)], [target], scale=0).abs() < 1e-6
 
 
 def test_terms_of_the_depth_objective_have_their_weights() -> None:
@@ -129,12 +124,12 @@ def test_terms_of_the_depth_objective_have_their_weights() -> None:
     ramp = 1 + torch.arange(SIZE[1], dtype=torch.float32).expand(1, 1, *SIZE)
     match = photometric_error(target, refined_target(target, brighter)).mean()
     expected = match + 0.01 * 0.2 + 1e-3 / 4 * (1 / ramp.mean())
-    torch.testing.assert_close(depth_objective(target, ramp, [brighter], scale=2), expected)
+    torch.testing.assert_close(depth_objective(target, ramp, [brighter], [target], scale=2), expected)
 
 
 def test_the_flow_objective_trains_the_flow_alone() -> None:
     source, change = picture(1).requires_grad_(), torch.zeros(1, 3, *SIZE, requires_grad=True)
-    seen = SourceView(source, flow_of(0.0, 0.0), torch.ones(1, 1, *SIZE), change, source.detach())
+    seen = SourceView(source, flow_of(0.0, 0.0), torch.ones(1, 1, *SIZE), change)
     flow_objective(picture(), [seen], scale=0).backward()
     assert source.grad is not None
     assert change.grad is None
@@ -144,7 +139,7 @@ def test_the_flow_objective_trains_the_flow_alone() -> None:
 def test_an_objective_without_sources_is_refused(objective: str) -> None:
     losses = {
         "flow": lambda: flow_objective(picture(), [], scale=0),
-        "depth": lambda: depth_objective(picture(), picture()[:, :1], [], scale=0),
+        "depth": lambda: depth_objective(picture(), picture()[:, :1], [], [], scale=0),
     }
     with pytest.raises(GeometryError, match="got none; give the frames beside it"):
         losses[objective]()

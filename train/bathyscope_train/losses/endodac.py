@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bathyscope.errors import GeometryError
-from bathyscope_train.losses.photometric import masked_average, photometric_error
+from bathyscope_train.losses.resemblance import masked_average, photometric_error
 from bathyscope_train.losses.smoothness import appearance_smoothness, disparity_smoothness, edge_aware_smoothness
 
 FLOW_SMOOTHNESS = 1e-3
@@ -24,18 +24,16 @@ APPEARANCE_SMOOTHNESS = 0.01
 
 @dataclass(frozen=True, slots=True)
 class SourceView:
-    """What one source says about the target, at the target's size."""
+    """What flow and appearance say of one source, at the target's size."""
 
     by_flow: Float[Tensor, "n 3 h w"]
-    """The source warped by the optical flow (:func:`~bathyscope_train.losses.photometric.warp_by_flow`)."""
+    """The source warped by the optical flow (:func:`~bathyscope_train.losses.corner_warping.warp_by_flow`)."""
     flow: Float[Tensor, "n 2 h w"]
     """That flow."""
     visible: Float[Tensor, "n 1 h w"]
     """Where the source sees the target (:func:`~bathyscope_train.losses.occlusion.visibility_mask`)."""
     appearance: Float[Tensor, "n 3 h w"]
     """Predicted change of colour."""
-    by_depth: Float[Tensor, "n 3 h w"]
-    """The source warped by depth, motion and intrinsics."""
 
 
 def refined_target(target: Float[Tensor, "n 3 h w"], view: SourceView) -> Float[Tensor, "n 3 h w"]:
@@ -71,6 +69,7 @@ def depth_objective(
     target: Float[Tensor, "n 3 h w"],
     disparity: Float[Tensor, "n 1 h2 w2"],
     views: Sequence[SourceView],
+    by_depth: Sequence[Float[Tensor, "n 3 h w"]],
     *,
     scale: int,
     edges: Float[Tensor, "n 3 h2 w2"] | None = None,
@@ -86,6 +85,8 @@ def depth_objective(
         target: The target frame.
         disparity: Of the target, at any size.
         views: One for each of the S sources.
+        by_depth: These sources warped by depth, motion and intrinsics
+            (:func:`~bathyscope_train.losses.corner_warping.warp_by_depth`).
         scale: The scale k, 0 the finest.
         edges: The target at the size of ``disparity``, where that is another than the target's own.
 
@@ -94,9 +95,9 @@ def depth_objective(
     """
     _need_views(views)
     losses = []
-    for view in views:
+    for view, warped in zip(views, by_depth, strict=True):
         refined, flowed = refined_target(target, view), view.by_flow.detach()
-        match = masked_average(photometric_error(view.by_depth, refined), view.visible)
+        match = masked_average(photometric_error(warped, refined), view.visible)
         agree = masked_average((refined - flowed).abs(), view.visible)
         smooth = appearance_smoothness(view.appearance, target - flowed, view.visible)
         losses.append(match + FLOW_AGREEMENT * agree + APPEARANCE_SMOOTHNESS * smooth)

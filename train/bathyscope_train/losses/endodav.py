@@ -4,7 +4,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bathyscope.errors import GeometryError
-from bathyscope_train.losses.photometric import masked_average, reproject, sample, warp_by_flow
+from bathyscope_train.losses.corner_warping import reproject, sample, warp_by_flow
+from bathyscope_train.losses.resemblance import masked_average
 from bathyscope_train.model.unprojection import invert_rigid
 
 _LEAST_DEPTH = 1e-3

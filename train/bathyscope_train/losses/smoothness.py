@@ -3,7 +3,7 @@
 from jaxtyping import Float
 from torch import Tensor
 
-from bathyscope_train.losses.photometric import masked_average
+from bathyscope_train.losses.resemblance import masked_average
 
 _SAFE_MEAN = 1e-7
 
