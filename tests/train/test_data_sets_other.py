@@ -29,7 +29,7 @@ def test_hamlyn_is_in_millimetres_with_nought_as_unknown(tmp_path: Path) -> None
     assert depth is not None
     np.testing.assert_array_equal(depth[0], 0)
     np.testing.assert_array_equal(depth[1:], 52)
-    assert (sequence.depth_unit, sequence.depth_range) == ("mm", (1.0, 150.0))
+    assert (sequence.depth_unit, sequence.depth_range) == ("mm", (1e-3, 150.0))
     np.testing.assert_allclose(sequence.intrinsics, trees.K_CORNER)
     assert sum("no such folder" in gap.reason for gap in opened.gaps) == 20
 

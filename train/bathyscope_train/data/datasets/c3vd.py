@@ -26,7 +26,7 @@ from bathyscope_train.evaluation.folders import parse_pose
 from bathyscope_train.evaluation.images import image_files
 from bathyscope_train.evaluation.sequences import Crop, EvaluationSet, Gap
 
-DEPTH_RANGE_MM = (0.0, 100.0)
+DEPTH_RANGE_MM = (1e-3, 100.0)
 PUBLISHED_VIDEOS, PUBLISHED_FRAMES = 22, 10_015
 """As the set's paper counts them."""
 _FULL_SIZE: Size = (1080, 1350)

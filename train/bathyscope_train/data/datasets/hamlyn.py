@@ -28,7 +28,7 @@ from bathyscope_train.data.datasets.sequence import DataSequence
 from bathyscope_train.evaluation.images import image_files
 from bathyscope_train.evaluation.sequences import Crop, EvaluationSet, Gap
 
-DEPTH_RANGE_MM = (1.0, 150.0)
+DEPTH_RANGE_MM = (1e-3, 150.0)
 """Of AF-SfMLearner, EndoDAC and EndoDAV; the set's authors used 1 to 300 mm."""
 LAST_UNCROPPED = 13
 """EndoDAC cuts columns 180 to 589 out of the sequences after this one, whose borders are black."""
