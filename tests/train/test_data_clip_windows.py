@@ -21,9 +21,10 @@ from bathyscope_train.data.clip_changes import ClipChanges, draw_changes, recolo
 from bathyscope_train.data.clip_loader import WindowLoader
 from bathyscope_train.data.clip_pictures import to_model_quickly
 from bathyscope_train.data.clip_sources import ClipSource, open_sources, open_windows
-from bathyscope_train.data.clip_survey import ClipSurvey, survey_clip
+from bathyscope_train.data.clip_survey import survey_clip
 from bathyscope_train.data.clip_windows import WindowSettings, choose_frames
 from bathyscope_train.data.datasets.videos import open_videos
+from bathyscope_train.data.survey_files import ClipSurvey
 
 SIZE = (56, 84)
 PLAIN = WindowSettings(frames=4, size=(28, 42), changes=ClipChanges.none(), motion_jitter=1)

@@ -17,8 +17,10 @@ from bathyscope.errors import DatasetError, SettingsError
 from bathyscope_train.data.cli import app
 from bathyscope_train.data.datasets.check import CheckReport, check_data
 from bathyscope_train.data.datasets.pose_agreement import pose_agreement
-from bathyscope_train.data.datasets.prepare_scared import DEPTH_SCALE_MM, prepare_scared
-from bathyscope_train.data.datasets.scared import open_scared, open_sequence
+from bathyscope_train.data.datasets.prepare_scared import prepare_scared
+from bathyscope_train.data.datasets.prepared_files import DEPTH_SCALE_MM
+from bathyscope_train.data.datasets.scared import open_scared
+from bathyscope_train.data.datasets.scared_sequence import open_sequence
 from bathyscope_train.data.datasets.scared_tree import find_scared
 from bathyscope_train.data.datasets.sequence import DataSequence
 from bathyscope_train.evaluation.folders import DatasetFolder

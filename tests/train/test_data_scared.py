@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from bathyscope.errors import DatasetError
-from bathyscope_train.data.datasets.scared import open_keyframe, open_scared, open_sequence
+from bathyscope_train.data.datasets.scared import open_scared
 from bathyscope_train.data.datasets.scared_frame_data import read_frame_data
+from bathyscope_train.data.datasets.scared_sequence import open_keyframe, open_sequence
 from bathyscope_train.data.datasets.scared_splits import frame_counts, scared_split, scared_splits
 from bathyscope_train.data.datasets.scared_tree import find_scared, is_scared
 from bathyscope_train.data.datasets.sequence import DataSequence

@@ -7,60 +7,35 @@ a share of the picture's width. What it finds can be kept in a folder, so a run 
 
 from __future__ import annotations
 
-import hashlib
-import json
-import zipfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, Field, PositiveFloat, PositiveInt
 
 from bathyscope.camera import Size
 from bathyscope.errors import DatasetError
-from bathyscope.vision.cuts import CutDetector, CutSettings
+from bathyscope.vision.cuts import CutDetector
 from bathyscope.vision.field_of_view import DARK, FieldOfView, find_field_of_view
 from bathyscope.vision.grid import Grid, choose_size
 from bathyscope_train.data.clip_pictures import to_model_quickly
 from bathyscope_train.data.datasets.sequence import DataSequence, Image
+from bathyscope_train.data.survey_files import (
+    ClipSurvey,
+    SurveySettings,
+    read_survey,
+    survey_fingerprint,
+    write_survey,
+)
 
 _SAMPLES = 24
 """Frames from all over the video that the field of view is read from."""
 _LIT_SHARE = 0.01
 """Of the pixels inside the field of view, that must not be black."""
 _NAMED = 5
-_FORMAT = 1
-
-
-class SurveySettings(BaseModel, frozen=True, extra="forbid"):
-    """What counts as usable; none of it is in the paper."""
-
-    pixels: PositiveInt = Field(default=9600, description="Area of the small pictures.")
-    still: PositiveFloat = Field(default=0.0008, description="Motion, as a share of the width, that is no motion.")
-    cuts: CutSettings = CutSettings()
-
-
-@dataclass(frozen=True, slots=True)
-class ClipSurvey:
-    """What a video holds."""
-
-    name: str
-    size: Size
-    """(height, width) of the frames that are used."""
-    view: FieldOfView
-    kept: NDArray[np.intp]
-    """(k,) numbers of the frames that are used."""
-    motion: NDArray[np.float64]
-    """(k,) how far each has moved from the one before it, as a share of the width; 0 where a shot begins."""
-    shots: NDArray[np.intp]
-    """(s + 1,) where in ``kept`` each shot begins, and its end."""
-    notes: tuple[str, ...]
-    """What was left out, in words."""
 
 
 def survey_clip(
@@ -79,11 +54,11 @@ def survey_clip(
     settings = settings or SurveySettings()
     if cache is None:
         return _survey(sequence, settings)
-    path = cache / f"survey_{_fingerprint(sequence, settings)}.npz"
-    known = _read(path) if path.is_file() else None
+    path = cache / f"survey_{survey_fingerprint(sequence, settings)}.npz"
+    known = read_survey(path) if path.is_file() else None
     if known is None:
         known = _survey(sequence, settings)
-        _write(path, known)
+        write_survey(path, known)
     return known
 
 
@@ -257,51 +232,3 @@ def _first_readable(sequence: DataSequence) -> Image:
 
 def _some(names: list[str]) -> str:
     return "; ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
-
-
-def _fingerprint(sequence: DataSequence, settings: SurveySettings) -> str:
-    digest = hashlib.sha256(f"{_FORMAT} {sequence.name} {sequence.size} {settings.model_dump_json()}".encode())
-    for name in sequence.frame_names:
-        digest.update(name.encode())
-    for path in sequence.frames.files():
-        state = path.stat() if path.is_file() else None
-        digest.update(f"{path.name} {state and (state.st_size, state.st_mtime_ns)}\n".encode())
-    if sequence.inside is not None:
-        digest.update(np.packbits(sequence.inside).tobytes())
-    return digest.hexdigest()[:24]
-
-
-def _write(path: Path, survey: ClipSurvey) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}")
-    about = {"name": survey.name, "size": survey.size, "shape": survey.view.shape, "notes": survey.notes}
-    with beside.open("wb") as file:
-        np.savez(
-            file,
-            about=np.array(json.dumps(about)),
-            inside=np.packbits(survey.view.mask),
-            kept=survey.kept,
-            motion=survey.motion,
-            shots=survey.shots,
-        )
-    beside.replace(path)
-
-
-def _read(path: Path) -> ClipSurvey | None:
-    """What an earlier run found; ``None`` where the file is damaged, so that it is made again."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            about: dict[str, Any] = json.loads(str(file["about"]))
-            height, width = about["size"]
-            inside = np.unpackbits(file["inside"], count=height * width).astype(np.bool_).reshape(height, width)
-            return ClipSurvey(
-                name=about["name"],
-                size=(height, width),
-                view=FieldOfView(inside, about["shape"]),
-                kept=file["kept"],
-                motion=file["motion"],
-                shots=file["shots"],
-                notes=tuple(about["notes"]),
-            )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-        return None

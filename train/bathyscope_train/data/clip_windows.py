@@ -32,8 +32,9 @@ from bathyscope_train.data.clip_changes import (
     recolour,
 )
 from bathyscope_train.data.clip_pictures import to_model_quickly
-from bathyscope_train.data.clip_survey import ClipSurvey, SurveySettings, survey_clips
+from bathyscope_train.data.clip_survey import survey_clips
 from bathyscope_train.data.datasets.sequence import DataSequence
+from bathyscope_train.data.survey_files import ClipSurvey, SurveySettings
 
 
 class WindowSettings(BaseModel, frozen=True, extra="forbid"):

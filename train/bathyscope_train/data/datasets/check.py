@@ -15,7 +15,8 @@ from bathyscope_train.data.datasets.catalogue import KINDS, recognise
 from bathyscope_train.data.datasets.own_folder import open_own_folder, own_folders
 from bathyscope_train.data.datasets.pitfalls import pitfalls
 from bathyscope_train.data.datasets.pose_agreement import pose_agreement
-from bathyscope_train.data.datasets.scared import open_keyframe, open_sequence, published_shortfall
+from bathyscope_train.data.datasets.scared import published_shortfall
+from bathyscope_train.data.datasets.scared_sequence import open_keyframe, open_sequence
 from bathyscope_train.data.datasets.scared_splits import frame_counts
 from bathyscope_train.data.datasets.scared_tree import find_scared
 from bathyscope_train.data.datasets.sequence import DataSequence

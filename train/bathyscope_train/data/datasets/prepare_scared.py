@@ -13,30 +13,31 @@ goes on where it stopped and a sequence with that file is whole.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.camera import F64
 from bathyscope.errors import DatasetError, SettingsError
 from bathyscope_train.data.datasets.depth_files import DepthCode, PointDepth, decode_image
-from bathyscope_train.data.datasets.scared import MOVED_DEPTH, open_keyframe, open_sequence, published_shortfall
-from bathyscope_train.data.datasets.scared_splits import WRONG_CALIBRATION, dataset_number, frame_counts, sequence_order
+from bathyscope_train.data.datasets.prepared_files import (
+    DEPTH_SCALE_MM,
+    encode_image,
+    write_beside,
+    write_intrinsics,
+    write_poses,
+)
+from bathyscope_train.data.datasets.scared import published_shortfall
+from bathyscope_train.data.datasets.scared_sequence import MOVED_DEPTH, open_keyframe, open_sequence
+from bathyscope_train.data.datasets.scared_splits import frame_counts, sequence_order
 from bathyscope_train.data.datasets.scared_tree import MARK, ScaredFolder, find_scared
 from bathyscope_train.data.datasets.sequence import DataSequence
 from bathyscope_train.data.datasets.tar_members import numbered_members
 from bathyscope_train.evaluation.sequences import F32
 
-DEPTH_SCALE_MM = 1 / 256
-"""One step of the depth written; the farthest is 256 mm, and metrics stop at 150."""
-AVERAGE_CAMERA = (0.82, 1.02, 0.5, 0.5)
-"""fx / width, fy / height, cx / width, cy / height: the mean of all calibrations, used where a sequence has none."""
 _LEVELS = 65535
 Progress = Callable[[str, int, int], None]
 
@@ -131,8 +132,8 @@ class _Work:
             entry.frames += 1
             self.progress(f"{folder.name}: frames", index + 1, len(numbers))
         self._all_depth(folder, sequence, set(numbers), target, entry)
-        _write_poses(target / "poses.txt", sequence, self.ending)
-        _write_intrinsics(target, sequence, entry)
+        write_poses(target / "poses.txt", sequence, self.ending)
+        entry.said += write_intrinsics(target, sequence)
         entry.said += _shortfall(folder.name, entry)
 
     def _all_depth(
@@ -166,13 +167,13 @@ class _Work:
             assert depth is not None
             self._depth(target / "depth" / "000000.png", depth, still.size)
             entry.new += 2
-            _write_intrinsics(target, still, entry)
+            entry.said += write_intrinsics(target, still)
 
     def _image(self, path: Path, image: NDArray[np.uint8]) -> None:
         import cv2
 
         options = [] if self.quality is None or path.suffix == ".png" else [cv2.IMWRITE_JPEG_QUALITY, self.quality]
-        _write(path, _encode(path.suffix, image[..., ::-1], options))
+        write_beside(path, encode_image(path.suffix, image[..., ::-1], options))
 
     def _depth(self, path: Path, depth: F32, size: tuple[int, int]) -> int:
         """Write a depth map; returns the pixels that are too far for it."""
@@ -180,7 +181,7 @@ class _Work:
             raise DatasetError(f"{path.stem}: depth of {depth.shape} for frames of {size}")
         steps = np.rint(depth / DEPTH_SCALE_MM)
         far = steps > _LEVELS
-        _write(path, _encode(".png", np.where(far, 0, steps).astype(np.uint16), []))
+        write_beside(path, encode_image(".png", np.where(far, 0, steps).astype(np.uint16), []))
         return int(far.sum())
 
 
@@ -199,75 +200,16 @@ def _depth_maps(folder: ScaredFolder, sequence: DataSequence) -> Iterator[tuple[
                 yield int(name), lambda depth=depth: depth  # type: ignore[misc]
 
 
-def _write_poses(path: Path, sequence: DataSequence, ending: str) -> None:
-    if sequence.world_from_camera is None:
-        return
-    lines = ["# file, then world_from_camera row by row; mm, x right, y down, z forward"]
-    for name, pose in zip(sequence.frame_names, sequence.world_from_camera, strict=True):
-        if np.isfinite(pose).all():
-            lines.append(" ".join([name + ending, *(f"{value:.12g}" for value in pose.ravel())]))
-    _write(path, ("\n".join(lines) + "\n").encode())
-
-
-def _write_intrinsics(target: Path, sequence: DataSequence, entry: Prepared) -> None:
-    height, width = sequence.size
-    matrix, source = sequence.intrinsics, "calibration of the sequence, moved to the corner of the first pixel"
-    if matrix is None:
-        matrix, source = _average_camera(height, width), "none found; the mean of SCARED's calibrations"
-        entry.said.append("no calibration (frame_data or endoscope_calibration.yaml); the mean of all is written")
-    notes = list(sequence.notes)
-    if dataset_number(sequence.name) in WRONG_CALIBRATION:
-        entry.said.append("calibration known to be wrong (data sets 4 and 5)")
-    values: dict[str, Any] = {
-        "width": width,
-        "height": height,
-        "fx": matrix[0, 0],
-        "fy": matrix[1, 1],
-        "cx": matrix[0, 2],
-        "cy": matrix[1, 2],
-        "pixel_origin": "(0,0) is the top-left corner of the top-left pixel",
-        "intrinsics_source": source,
-        "depth": "uint16 PNG, z along the optical axis; depth_mm = value * depth_scale; 0 = nothing",
-        "depth_scale": DEPTH_SCALE_MM,
-        "depth_unit": "mm",
-        "pose_unit": "mm" if sequence.world_from_camera is not None else None,
-        "depth_valid": list(sequence.depth_range or (0, 150)),
-        "notes": notes,
-        "source": f"SCARED {sequence.name}, left eye, distorted and not rectified",
-    }
-    _write(target / "intrinsics.json", (json.dumps(values, indent=1) + "\n").encode())
-
-
-def _average_camera(height: int, width: int) -> F64:
-    fx, fy, cx, cy = AVERAGE_CAMERA
-    return np.array([[fx * width, 0.0, cx * width], [0.0, fy * height, cy * height], [0.0, 0.0, 1.0]])
-
-
 def _shortfall(name: str, entry: Prepared) -> list[str]:
     said = published_shortfall(name, entry.frames)
     without = entry.frames - entry.depth
     return ([said] if said else []) + ([f"{without} frames without depth"] if without else [])
 
 
-def _encode(ending: str, image: NDArray[Any], options: list[int]) -> bytes:
-    import cv2
-
-    good, data = cv2.imencode(ending, np.ascontiguousarray(image), options)
-    assert good
-    return data.tobytes()
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    beside.write_bytes(data)
-    beside.replace(path)
-
-
 def _stamp(out: Path, quality: int | None) -> None:
     values = {"dataset": "scared", "jpeg_quality": quality, "depth_scale_mm": DEPTH_SCALE_MM, "about": MOVED_DEPTH}
     text = json.dumps(values, indent=1) + "\n"
     if not (out / MARK).is_file():
-        _write(out / MARK, text.encode())
+        write_beside(out / MARK, text.encode())
     elif (out / MARK).read_text(encoding="utf-8") != text:
         raise SettingsError(f"{out / MARK}: begun with other settings; use the same --jpeg-quality, or another folder")
