@@ -11,9 +11,12 @@ from scipy.spatial.transform import Rotation
 
 from bathyscope.errors import SettingsError
 from bathyscope_train.data.synthetic import DOMAINS, Domain, SyntheticClip, optical_flow, read_clip, render_clip
+from bathyscope_train.data.synthetic.clip import plan_clip, render_frame_of
 from bathyscope_train.data.synthetic.domain import LifeRanges
-from bathyscope_train.data.synthetic.lens import PINHOLE, Distortion
+from bathyscope_train.data.synthetic.lens import PINHOLE, Distortion, undistort
 from bathyscope_train.data.synthetic.shards import write_clip
+from bathyscope_train.data.synthetic.swell import carried, swollen
+from bathyscope_train.data.synthetic.tracing import at_rest
 
 Array = npt.NDArray[np.float64]
 SIZE = (40, 50)
@@ -133,6 +136,22 @@ def test_tissue_that_moves_is_followed_where_a_rigid_scene_would_err(family: str
     followed, rigid = landing_error(clip, 0, 4), landing_error(clip, 0, 4, rigid=True)
     assert np.median(followed) < 0.0025
     assert np.median(followed) < 0.3 * np.median(rigid)
+
+
+@pytest.mark.parametrize("family", ["lumen", "cavity"])
+def test_the_texture_of_a_point_stays_the_one_it_has_at_rest_while_the_point_moves(family: str) -> None:
+    domain = alive(family, breathing=1.0, peristalsis=1.0, amplitude=(0.06, 0.06))
+    plan = plan_clip(3, domain, frames=9, size=SIZE)
+    assert plan.swell is not None
+    still = render_frame_of(replace(plan, swell=None), 0)
+    depth = still.depth[::8, ::8].astype(float)[..., None]
+    rays = np.concatenate([undistort((pixels() - K[:2, 2]) / 45.0, PINHOLE), np.ones((*SIZE, 1))], axis=-1)[::8, ::8]
+    points = (rays * depth) @ plan.scene_from_camera[0][:3, :3].T + plan.scene_from_camera[0][:3, 3]
+    early, late = swollen(plan.scene.surface, plan.swell, 2), swollen(plan.scene.surface, plan.swell, 7)
+    for point in points.reshape(-1, 3):
+        moved = carried(plan.swell, point, 2, 7)
+        np.testing.assert_allclose(at_rest(early, *point), at_rest(late, *moved), atol=2e-3)
+    assert at_rest(plan.scene.surface, 1.0, 2.0, 30.0) == (1.0, 2.0, 30.0)
 
 
 def test_tissue_that_moves_by_nothing_gives_the_bytes_of_still_tissue() -> None:

@@ -22,6 +22,9 @@ BLOCK = 8
 EVEN = np.ones((1, 1), np.float32)
 
 
+STILL = np.zeros((0, 4))
+
+
 class Surface(NamedTuple):
     """Geometry, in millimetres of the scene's own frame."""
 
@@ -44,6 +47,9 @@ class Surface(NamedTuple):
     """Longest step of the ray marcher inside the core."""
     feature_mm: float
     """Size of the creases that are darkened."""
+    waves: npt.NDArray[np.float64] = STILL
+    """``(n, 4)``: by what its heights differ from those of the tissue at rest, whose texture it keeps: amplitude,
+    radians per unit along rows and along columns (angle or mm), phase; see ``swell``."""
 
 
 class Tissue(NamedTuple):

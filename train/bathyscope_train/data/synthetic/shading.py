@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from bathyscope_train.data.synthetic.compiled import jit
 from bathyscope_train.data.synthetic.scene import TUBE, Surface, Tissue
-from bathyscope_train.data.synthetic.tracing import free_depth, normal, place
+from bathyscope_train.data.synthetic.tracing import at_rest, free_depth, normal, place
 
 Array = npt.NDArray[np.float64]
 
@@ -224,8 +224,9 @@ def shade(
     """Radiance of a surface point into ``out[:3]``, and how much of it is highlight into ``out[3]``."""
     cell = surface.step[0]
     nx, ny, nz = normal(surface, x, y, z, max(1.5 * cell, 0.4 * footprint))
-    fine, capillary = _octaves(tissue, x, y, z, footprint, grain, coarse)
-    region = _region(tissue, x, y, z, coarse)
+    tx, ty, tz = at_rest(surface, x, y, z)  # its texture goes with the tissue
+    fine, capillary = _octaves(tissue, tx, ty, tz, footprint, grain, coarse)
+    region = _region(tissue, tx, ty, tz, coarse)
     gloss = _colour(surface, tissue, x, y, z, footprint, grain, capillary, region, out)
 
     # The relief tilts the normal only as far as a pixel resolves it; the rest widens the highlight.
@@ -238,7 +239,7 @@ def shade(
     coat, wx, wy, wz = 0.0, nx, ny, nz
     if tissue.coat > 0.0:
         gx, gy, gz = 0.35 * fine * grain[2], 0.35 * fine * grain[3], 0.35 * fine * grain[4]
-        coat = 7.0 * tissue.coat * _film(tissue, x, y, z, grain)
+        coat = 7.0 * tissue.coat * _film(tissue, tx, ty, tz, grain)
         wx, wy, wz = _tilt(nx, ny, nz, gx + grain[2], gy + grain[3], gz + grain[4], tissue.coat_bump)
 
     vx, vy, vz = (camera[0, 3] - x) / distance, (camera[1, 3] - y) / distance, (camera[2, 3] - z) / distance

@@ -88,8 +88,16 @@ def swollen(surface: Surface, swell: Swell, frame: float) -> Surface:
     heights = surface.heights + gain(swell, along, place, frame)
     most = float(np.abs(swell.waves[:, 0]).sum())
     return surface._replace(
-        heights=np.ascontiguousarray(heights, np.float32), core=np.ascontiguousarray(surface.core - most, np.float32)
+        heights=np.ascontiguousarray(heights, np.float32),
+        core=np.ascontiguousarray(surface.core - most, np.float32),
+        waves=now(swell, frame),
     )
+
+
+def now(swell: Swell, frame: float) -> Array:
+    """The waves as a ``Surface`` of one frame holds them, ``(n, 4)``."""
+    amplitude, along, across, turn, phase = swell.waves.T
+    return np.stack([amplitude, along, across, phase - turn * frame], axis=1)
 
 
 def carried(swell: Swell, points: Array, source: float, target: float) -> Array:

@@ -22,7 +22,7 @@ from bathyscope_train.data.synthetic.shading import (
 )
 from bathyscope_train.data.synthetic.torch_layout import Atlas
 from bathyscope_train.data.synthetic.torch_scene import CameraTensors, LampTensors, SurfaceTensors, TissueTensors
-from bathyscope_train.data.synthetic.torch_tracing import at_rest, Points, Values, free_depth, normal, place
+from bathyscope_train.data.synthetic.torch_tracing import Points, Values, at_rest, free_depth, normal, place
 
 
 class View(NamedTuple):

@@ -35,6 +35,29 @@ def place(surface: Surface, x: float, y: float, z: float) -> tuple[float, float,
 
 
 @jit
+def at_rest(surface: Surface, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Where a point of swollen tissue is while it rests; the point itself where nothing swells."""
+    if surface.waves.shape[0] == 0:
+        return x, y, z
+    along, across, dx, dy, reach = y, x, 0.0, 0.0, 1.0
+    if surface.kind == TUBE:
+        row = (z - surface.first[0]) * surface.density[0]
+        last = surface.centre.shape[0] - 1
+        i = min(max(int(row), 0), last - 1)
+        s = min(max(row - i, 0.0), 1.0)
+        dx = x - ((1 - s) * surface.centre[i, 0] + s * surface.centre[i + 1, 0])
+        dy = y - ((1 - s) * surface.centre[i, 1] + s * surface.centre[i + 1, 1])
+        along, across, reach = z, np.arctan2(dy, dx), max(np.sqrt(dx * dx + dy * dy), 1e-9)
+    gain = 0.0
+    for n in range(surface.waves.shape[0]):
+        wave = surface.waves[n]
+        gain += wave[0] * np.cos(wave[1] * along + wave[2] * across + wave[3])
+    if surface.kind == TUBE:
+        return x - gain * dx / reach, y - gain * dy / reach, z
+    return x, y, z - gain
+
+
+@jit
 def free_depth(surface: Surface, x: float, y: float, z: float) -> float:
     """Positive in free space, zero on the surface; for a tube the distance to the wall within the slice."""
     row, column, reach = place(surface, x, y, z)
