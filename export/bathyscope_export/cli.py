@@ -26,6 +26,10 @@ def export(  # noqa: PLR0917 - typer: one parameter an option
     research_only: Annotated[
         bool, typer.Option("--research-only", help="The weights may not be used otherwise.")
     ] = False,
+    half_weights: Annotated[
+        bool,
+        typer.Option("--half-weights", help="Round weights to bfloat16 and store them so: half the size."),
+    ] = False,
     accuracy: Annotated[
         Path | None,
         typer.Option(exists=True, dir_okay=False, help="JSON object with measured accuracy, for the manifest."),
@@ -55,6 +59,7 @@ def export(  # noqa: PLR0917 - typer: one parameter an option
             input=InputSpec(patch=network.preset.patch_size, pixels=pixels, window=window, overlap=overlap),
             licence=licence,
             research_only=research_only,
+            half_weights=half_weights,
             training=training_of(checkpoint),
             accuracy={} if accuracy is None else _read_accuracy(accuracy),
         )

@@ -20,7 +20,7 @@ def externalise(models: Iterable[onnx.ModelProto], path: Path) -> None:
     with path.open("wb") as file:
         for model in models:
             for tensor in model.graph.initializer:
-                data = numpy_helper.to_array(tensor).tobytes()
+                data = tensor.raw_data or numpy_helper.to_array(tensor).tobytes()
                 if len(data) < INLINE_BYTES:
                     continue
                 digest = hashlib.sha256(data).digest()

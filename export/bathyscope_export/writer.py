@@ -2,7 +2,8 @@
 
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
@@ -21,8 +22,9 @@ from bathyscope.errors import BundleError
 from bathyscope.model_spec import InputSpec
 from bathyscope_export.card import write_card
 from bathyscope_export.graph import export_stage
+from bathyscope_export.half_weights import halve_weights, round_to_bfloat16
 from bathyscope_export.parity import SHAPES, compare
-from bathyscope_export.stages import split
+from bathyscope_export.stages import Stage, split
 from bathyscope_export.weights import externalise
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.specs import scene_spec
@@ -44,6 +46,8 @@ class BundleSettings:
     """How the weights came about; paths in it are cut to their last part."""
     accuracy: Mapping[str, Any] = field(default_factory=dict)
     """Measured accuracy, with protocol."""
+    half_weights: bool = False
+    """Round weights to bfloat16 and store them so."""
     shapes: tuple[tuple[int, int, int], ...] = SHAPES
     """Clips on which the graphs are compared with PyTorch: frames, rows and columns of patches."""
 
@@ -67,7 +71,15 @@ def write_bundle(
 
     Raises:
         BundleError: If the folder exists, the graphs differ from PyTorch, or their attention is quadratic in memory.
-        CheckpointError: If the network has no Gaussian head.
+    """
+    return placed(folder, lambda beside: _fill(network, beside, settings, progress), replace=replace)
+
+
+def placed(folder: Path, fill: Callable[[Path], None], *, replace: bool) -> Bundle:
+    """A bundle that ``fill`` writes beside, checked and renamed into place.
+
+    Raises:
+        BundleError: If the folder exists and may not be replaced, or what was written is no bundle.
     """
     if folder.exists() and not replace:
         raise BundleError(f"{folder} exists; remove it, choose another name, or replace it")
@@ -77,7 +89,7 @@ def write_bundle(
     beside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     try:
         beside.chmod(0o755)
-        _fill(network, beside, settings, progress)
+        fill(beside)
         Bundle.open(beside)
         if folder.exists():
             shutil.rmtree(folder)
@@ -89,6 +101,9 @@ def write_bundle(
 
 
 def _fill(network: Network, folder: Path, settings: BundleSettings, progress: Callable[[str], None]) -> None:
+    if settings.half_weights:
+        network = deepcopy(network)
+        round_to_bfloat16(network)
     graphs = write_graphs(network, folder, progress)
     progress(f"comparing with PyTorch on {len(settings.shapes)} clips")
     differences = compare(network, folder, graphs, settings.shapes)
@@ -120,10 +135,18 @@ def write_graphs(
     network: Network, folder: Path, progress: Callable[[str], None] = lambda message: None
 ) -> dict[Role, GraphSpec]:
     """Trace the three stages and write them, with their weights, into ``folder``."""
+    return write_stages(split(network), folder, patch=network.preset.patch_size, progress=progress)
+
+
+def write_stages(
+    stages: Iterable[Stage], folder: Path, *, patch: int, progress: Callable[[str], None] = lambda message: None
+) -> dict[Role, GraphSpec]:
+    """Trace stages and write them, with their weights, into ``folder``."""
     models: dict[Role, onnx.ModelProto] = {}
-    for stage in split(network):
+    for stage in stages:
         progress(f"tracing {stage.role}")
-        models[stage.role] = export_stage(stage, patch=network.preset.patch_size)
+        models[stage.role] = export_stage(stage, patch=patch)
+        halve_weights(models[stage.role])
     externalise(models.values(), folder / WEIGHTS)
     specs: dict[Role, GraphSpec] = {}
     for role, model in models.items():
