@@ -1,4 +1,4 @@
-"""From a clip to EndoDAV's objective: EndoDAC's for each frame with two neighbours, and agreement of adjacent depths."""
+"""From a clip to EndoDAV's objective: EndoDAC's for each frame with two neighbours, and adjacent depths that agree."""
 
 from dataclasses import dataclass
 
