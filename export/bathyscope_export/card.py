@@ -32,17 +32,18 @@ def write_card(
         "",
         "## Training",
         "",
-        *_items(training),
+        *items(training),
         "",
         "## Accuracy",
         "",
-        *_items(settings.accuracy),
+        *items(settings.accuracy),
         "",
     ]
     path.write_text("\n".join(lines), encoding="utf-8")
 
 
-def _items(record: Mapping[str, Any]) -> list[str]:
+def items(record: Mapping[str, Any]) -> list[str]:
+    """Lines of a list, for a card."""
     return [f"* {key}: {value}" for key, value in record.items()] or ["Nothing is recorded."]
 
 

@@ -81,6 +81,8 @@ def _simplify(model: onnx_ir.Model) -> None:
 
 
 def _dynamic_shapes(stage: Stage, patch: int) -> tuple[Any, ...]:
+    if stage.shapes is not None:
+        return stage.shapes
     frames = Dim("frames", min=1, max=_MOST_FRAMES)
     rows, columns = (Dim(name, min=_SMALLEST_SIDE, max=_LARGEST_SIDE) for name in ("rows", "columns"))
     height, width = patch * rows, patch * columns
@@ -102,13 +104,13 @@ def axes(name: str) -> tuple[str, ...]:
     kind, _, index = name.partition("_")
     if name == "focal":
         return ("",)
-    if name in ("depth", "confidence", "refined_depth"):
+    if name in ("depth", "confidence", "refined_depth", "values"):
         return ("frames", "height", "width")
     if name in ("images", "gaussians"):
         return ("frames", "", "height", "width")
     if kind == "tokens":
         return ("frames", "rows", "columns", "")
-    if kind == "stem":
+    if kind in ("stem", "path", "level"):
         return ("frames", "", f"height_{index}", f"width_{index}")
     return ("frames", "")
 
@@ -121,7 +123,7 @@ def _tidy(model: onnx.ModelProto, stage: Stage) -> None:
         graph.input.remove(value)
     for value in (*graph.input, *graph.output):
         for axis, dimension in zip(axes(value.name), value.type.tensor_type.shape.dim, strict=True):
-            if axis:
+            if axis and not dimension.HasField("dim_value"):
                 dimension.dim_param = axis
     del graph.value_info[:]
     for part in (model, graph, *graph.node, *graph.initializer, *graph.input, *graph.output):

@@ -12,7 +12,7 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bathyscope.bundle import GraphSpec, Role
+from bathyscope.bundle import ROLES, GraphSpec, Role
 from bathyscope.errors import BundleError
 from bathyscope_train.model.network import Network, Prediction
 from bathyscope_train.model.pose_encoding import decode_cameras
@@ -78,7 +78,7 @@ def compare(
         graphs: Their files, inputs and outputs.
         shapes: Frames, rows and columns of each clip.
     """
-    sessions = {role: _session(folder / graph.file) for role, graph in graphs.items()}
+    sessions = {role: start(folder / graph.file) for role, graph in graphs.items()}
     differences = []
     for frames, rows, columns in shapes:
         patch = network.preset.patch_size
@@ -100,11 +100,13 @@ def sample_clip(frames: int, height: int, width: int) -> Tensor:
 
 
 def run_graphs(
-    sessions: Mapping[Role, ort.InferenceSession], graphs: Mapping[Role, GraphSpec], images: NDArray[np.float32]
+    sessions: Mapping[Role, ort.InferenceSession],
+    graphs: Mapping[Role, GraphSpec],
+    images: NDArray[np.float32],
+    order: tuple[Role, ...] = ROLES["scene"],
 ) -> dict[str, NDArray[np.float32]]:
     """Everything that the graphs say about frames (t, 3, h, w), by name."""
     known = {"images": images, "focal": np.zeros(1, np.float32)}
-    order: tuple[Role, ...] = ("backbone", "heads", "cameras")
     for role in order:
         graph = graphs[role]
         values = sessions[role].run(list(graph.outputs), {name: known[name] for name in graph.inputs})
@@ -112,7 +114,8 @@ def run_graphs(
     return known
 
 
-def _session(path: Path) -> ort.InferenceSession:
+def start(path: Path) -> ort.InferenceSession:
+    """A graph, loaded by ONNX Runtime."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = torch.get_num_threads()
     options.log_severity_level = 3
@@ -122,7 +125,6 @@ def _session(path: Path) -> ort.InferenceSession:
 
 def _difference(expected: Prediction, observed: Mapping[str, NDArray[np.float32]]) -> Difference:
     maps = expected.maps
-    assert maps.gaussians is not None
     size = (maps.depth.shape[-2], maps.depth.shape[-1])
     encodings = expected.pose_encoding[0].double(), torch.from_numpy(observed["pose_encoding"]).double()
     poses = [invert_rigid(decode_cameras(encoding, size).camera_from_world) for encoding in encodings]
@@ -135,19 +137,23 @@ def _difference(expected: Prediction, observed: Mapping[str, NDArray[np.float32]
         frames=maps.depth.shape[1],
         height=size[0],
         width=size[1],
-        depth=_spread(maps.depth[0], observed.get("refined_depth", observed["depth"])),
-        confidence=_spread(maps.confidence[0], observed["confidence"]),
-        gaussians=max(
-            _spread(maps.gaussians[0, :, channel], observed["gaussians"][:, channel])
-            for channel in range(maps.gaussians.shape[2])
-        ),
+        depth=spread(maps.depth[0], observed.get("refined_depth", observed["depth"])),
+        confidence=spread(maps.confidence[0], observed["confidence"]),
+        gaussians=_gaussian_difference(maps.gaussians, observed),
         rotation=(sine.norm(dim=-1) / 2).max().item(),
         translation=(centres[0] - centres[1]).norm(dim=-1).max().item() / scale,
         field_of_view=(encodings[0][:, 7:] - encodings[1][:, 7:]).abs().max().item(),
     )
 
 
-def _spread(expected: Tensor, observed: NDArray[np.float32]) -> float:
+def _gaussian_difference(expected: Tensor | None, observed: Mapping[str, NDArray[np.float32]]) -> float:
+    if expected is None:
+        return 0.0
+    channels = range(expected.shape[2])
+    return max(spread(expected[0, :, channel], observed["gaussians"][:, channel]) for channel in channels)
+
+
+def spread(expected: Tensor, observed: NDArray[np.float32]) -> float:
     """Largest difference over the standard deviation; plain relative error hides errors in a nearly constant map."""
     difference = np.abs(observed.astype(np.float64) - expected.double().numpy()).max()
     return float(difference / max(expected.double().std().item(), 1e-12))

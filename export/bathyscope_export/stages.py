@@ -6,12 +6,12 @@ time; ``cameras`` see the clip again, but only what they need of it.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from bathyscope.bundle import Role
-from bathyscope.errors import CheckpointError
 from bathyscope_train.model.network import Features, Network
 
 _FRAMES, _ROWS, _COLUMNS = 4, 8, 10
@@ -27,16 +27,12 @@ class Stage:
     """Example inputs; their sizes all differ, so that none is mistaken for another or for a constant."""
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
+    shapes: tuple[dict[int, Any], ...] | None = None
+    """Dynamic axes of each argument, as ``torch.export`` takes them; those that its name implies unless given."""
 
 
 def split(network: Network) -> tuple[Stage, ...]:
-    """Backbone, heads and cameras of a network.
-
-    Raises:
-        CheckpointError: If the network has no Gaussian head; the service renders Gaussians.
-    """
-    if network.gaussian_param_head is None:
-        raise CheckpointError(f"the {network.preset.name!r} network has no Gaussian head; a bundle needs one")
+    """Backbone, heads and cameras of a network; the heads give Gaussians where the network has any."""
     patch = network.preset.patch_size
     images = torch.rand(_FRAMES, 3, patch * _ROWS, patch * _COLUMNS, generator=torch.Generator().manual_seed(0))
     backbone = Backbone(network)
@@ -53,7 +49,7 @@ def split(network: Network) -> tuple[Stage, ...]:
             Heads(network),
             (images, *(named[name] for name in (*tokens, *stem))),
             ("images", *tokens, *stem),
-            ("depth", "confidence", "gaussians"),
+            ("depth", "confidence") if network.gaussian_param_head is None else ("depth", "confidence", "gaussians"),
         ),
         _camera_stage(network, named, torch.ones(_FRAMES, *images.shape[-2:])),
     )
@@ -90,7 +86,7 @@ class Backbone(nn.Module):
 
 
 class Heads(nn.Module):
-    """Images, tokens and stem maps to depth and confidence (t, h, w) and raw Gaussians (t, g, h, w)."""
+    """Images, tokens and stem maps to depth and confidence (t, h, w) and, if there are any, Gaussians (t, g, h, w)."""
 
     def __init__(self, network: Network) -> None:
         super().__init__()
@@ -106,8 +102,8 @@ class Heads(nn.Module):
             ),
         )
         maps = self.network.dense(known, images[None])
-        assert maps.gaussians is not None
-        return maps.depth[0], maps.confidence[0], maps.gaussians[0]
+        gaussians = () if maps.gaussians is None else (maps.gaussians[0],)
+        return maps.depth[0], maps.confidence[0], *gaussians
 
 
 class TokenCameras(nn.Module):

@@ -17,7 +17,7 @@ from onnx import TensorProto, helper
 from typer.testing import CliRunner
 
 from bathyscope.bundle import Bundle, Role
-from bathyscope.errors import BundleError, CheckpointError
+from bathyscope.errors import BundleError
 from bathyscope.model_spec import InputSpec
 from bathyscope_export.attention import check_linear_attention, fused_count
 from bathyscope_export.cli import app
@@ -32,9 +32,11 @@ from bathyscope_train.model.presets import (
     AggregatorSettings,
     DptSettings,
     IterativeCameraSettings,
+    MatchingCameraSettings,
     SceneSettings,
     VitSettings,
 )
+from bathyscope_train.model.specs import scene_spec
 
 SMALL = NetworkPreset(
     name="small",
@@ -208,7 +210,7 @@ def test_cameras_solved_from_matches_export_too(tmp_path: Path) -> None:
     preset = get_preset("tiny")
     small = {
         "aggregator": preset.aggregator.model_copy(update={"width": 24, "depth": 1, "heads": 1, "taps": (0,)}),
-        "camera": preset.camera.model_copy(update={"rounds": 1, "iterations": 1}),
+        "camera": MatchingCameraSettings(rounds=1, iterations=1, focal_steps=1, final_iterations=1, settling=1),
     }
     network = Network(preset.model_copy(update=small)).eval()
     torch.nn.init.normal_(network.camera_head.refiner.readout.weight, std=0.05)
@@ -304,11 +306,12 @@ def test_paths_are_cut_to_their_last_part() -> None:
     assert strip_paths(record) == {"out": "run7", "folders": ["b", "c/d"], "steps": 3, "inner": {"x": "y"}}
 
 
-def test_a_network_without_gaussians_is_refused(tmp_path: Path) -> None:
+def test_heads_of_a_network_without_gaussians_give_depth_alone() -> None:
     network = Network(SMALL.model_copy(update={"gaussians": None})).eval()
-    with pytest.raises(CheckpointError, match="no Gaussian head"):
-        write_bundle(network, tmp_path / "bundle", SETTINGS)
-    assert list(tmp_path.iterdir()) == []
+    _, heads, _ = split(network)
+    model = export_stage(heads, patch=14)
+    assert [value.name for value in model.graph.output] == ["depth", "confidence"]
+    assert not scene_spec(network.preset).gaussians
 
 
 def test_command_says_what_is_wrong_and_writes_nothing(tmp_path: Path) -> None:
