@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,12 +18,19 @@ from numpy.typing import NDArray
 from bathyscope.errors import DatasetError
 from bathyscope.vision.field_of_view import FieldOfView
 from bathyscope.vision.grid import Grid
-from bathyscope_train.data.clip_changes import ClipChanges, draw_changes, recolour
+from bathyscope_train.data.clip_changes import (
+    ClipChanges,
+    crop_view,
+    draw_changes,
+    mirror_frames,
+    mirror_intrinsics,
+    recolour,
+)
 from bathyscope_train.data.clip_loader import WindowLoader
 from bathyscope_train.data.clip_pictures import to_model_quickly
 from bathyscope_train.data.clip_sources import ClipSource, open_sources, open_windows
 from bathyscope_train.data.clip_survey import survey_clip
-from bathyscope_train.data.clip_windows import WindowSettings, choose_frames
+from bathyscope_train.data.clip_windows import WindowSettings, choose_frames, intrinsics_at
 from bathyscope_train.data.datasets.videos import open_videos
 from bathyscope_train.data.survey_files import ClipSurvey
 
@@ -252,6 +260,26 @@ def test_points_keep_their_pixels_under_every_change(tmp_path: Path) -> None:
         still = np.abs(b - a)[..., 12:-12].mean()
         assert np.abs(moved - a[..., 12:-12]).mean() < 0.35 * still
     assert len(seen) > 1
+
+
+@pytest.mark.parametrize("flip", [(False, False), (True, False), (False, True), (True, True)])
+def test_camera_follows_crop_and_mirrors(flip: tuple[bool, bool]) -> None:
+    # A picture whose red is u and green v, at source size; a point must be found where the new camera puts it.
+    height, width = 80, 120
+    v, u = np.mgrid[:height, :width] + 0.5
+    image = np.stack([u, v, 0 * u], -1).astype(np.uint8)
+    camera = np.array([[90.0, 0, 55], [0, 95.0, 45], [0, 0, 1]])
+    drawn = replace(draw_changes(ClipChanges(), np.random.default_rng(1)), share=0.7, place=(0.2, 0.9), flip=flip)
+    view = crop_view(FieldOfView(np.ones((height, width), np.bool_), "full"), drawn)
+    grid = Grid.of(view, (28, 42))
+    picture = mirror_frames(to_model_quickly(grid, image), drawn) * 255
+    turned = mirror_intrinsics(intrinsics_at(camera, grid), grid.size, drawn)
+    point = np.array([0.1, -0.08, 1.0])
+    expected = camera @ point
+    sign = np.array([-1 if flip[0] else 1, -1 if flip[1] else 1, 1])
+    column, row, _ = turned @ (sign * point)
+    found = picture[:2, int(row), int(column)]
+    np.testing.assert_allclose(found, expected[:2], atol=2.5)  # a pixel of the window covers two of the source
 
 
 def test_colour_changes_are_the_same_for_all_frames_and_black_stays_black() -> None:

@@ -168,7 +168,7 @@ class ClipWindows:
         grid = self._grid(survey.view, drawn)
         frames = np.stack([to_model_quickly(grid, image) for image in _read(sequence, survey, indices)])
         size = grid.size
-        intrinsics = None if sequence.intrinsics is None else _intrinsics_at(sequence.intrinsics, grid)
+        intrinsics = None if sequence.intrinsics is None else intrinsics_at(sequence.intrinsics, grid)
         poses = None if sequence.world_from_camera is None else sequence.world_from_camera[indices]
         known = poses is not None and bool(np.isfinite(poses).all())
         return FrameWindow(
@@ -223,6 +223,7 @@ def _read(sequence: DataSequence, survey: ClipSurvey, indices: list[int]) -> lis
     return [images[index] for index in indices]
 
 
-def _intrinsics_at(intrinsics: F64, grid: Grid) -> F64:
+def intrinsics_at(intrinsics: F64, grid: Grid) -> F64:
+    """Intrinsics (3, 3) at source size for the network's image."""
     top, left, _, _ = grid.field_of_view.box
     return scale_intrinsics(crop_intrinsics(intrinsics, left, top), grid.crop_size, grid.size)
