@@ -28,14 +28,13 @@ from bathyscope_train.model.focal_layer import focal_step, fuse_focal
 from bathyscope_train.model.pose_encoding import matrix_to_quaternion
 from bathyscope_train.model.pose_graph import settle_trajectory
 from bathyscope_train.model.pose_layer import Motion, Solution, project, rays, solve_motion
+from bathyscope_train.model.presets import MatchingCameraSettings
 from bathyscope_train.model.stem import CELL
 from bathyscope_train.model.trajectory import ClipPairs, clip_pairs, fuse_trajectory
 
 _TYPICAL_FOCAL = 0.45
 _OUTSIDE = 4.0
-_FOCAL_STEPS = 2
 _INITIAL_FOCAL_PRIOR = 3.0  # exp(3) = 20: the first estimate is good to about 22 %
-_FINAL_ITERATIONS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,17 +107,20 @@ class MatchingCameraHead(nn.Module):
         width: Channels of a camera token and of a tapped token.
         stem_channels: Channels of the stem's quarter-size map.
         patch_size: Side of a patch in pixels.
-        rounds: How often matches are looked up and the motion is solved.
-        iterations: Solver iterations a round.
+        settings: How often matches are looked up and motions are solved.
     """
 
     def __init__(
-        self, width: int, *, stem_channels: int, patch_size: int = 14, rounds: int = 2, iterations: int = 3
+        self,
+        width: int,
+        *,
+        stem_channels: int,
+        patch_size: int = 14,
+        settings: MatchingCameraSettings = MatchingCameraSettings(),
     ) -> None:
         super().__init__()
         self.patch_size = patch_size
-        self.rounds = rounds
-        self.iterations = iterations
+        self.settings = settings
         self.focal = FocalHead(width)
         self.focal_prior = nn.Parameter(torch.tensor(_INITIAL_FOCAL_PRIOR))
         self.encoder = MatchingEncoder(width, stem_channels)
@@ -154,7 +156,7 @@ class MatchingCameraHead(nn.Module):
         refined = torch.where(known > 0, known, refined)
         correction = self.correct_depth(clip, estimates, refined, pairs)
         solution = self.resolve(clip, estimates, refined, pairs, depth=clip.depth * correction.exp())
-        trajectory = _trajectory(solution, pairs)
+        trajectory = _trajectory(solution, pairs, self.settings.settling)
         fields = [2 * torch.atan(0.5 * side / refined) for side in (height, width)]
         encoding = [
             trajectory.translation * scale[:, None, None],
@@ -193,14 +195,14 @@ class MatchingCameraHead(nn.Module):
         motion = Motion.none(points[:, 0])
         base = correlation.best
         rounds = []
-        for index in range(self.rounds):
+        for index in range(self.settings.rounds):
             if index:
                 motion = motion.detach()
                 low, high = -principal - _OUTSIDE, principal + _OUTSIDE
                 base = torch.minimum(torch.maximum(project(points, motion, cells), low), high) + principal
             matches, trust = self.matcher.correct(correlation, base.detach(), context, distance.log(), position)
             matches = matches - principal
-            solution = solve_motion(points, matches, trust, cells, motion, iterations=self.iterations)
+            solution = solve_motion(points, matches, trust, cells, motion, iterations=self.settings.iterations)
             motion = solution.motion
             rounds.append(Round(matches, trust, solution))
         return PairEstimates(correlation, tuple(rounds))
@@ -213,7 +215,7 @@ class MatchingCameraHead(nn.Module):
         last = estimates.last
         distance = clip.depth[:, pairs.source].flatten(0, 1)
         shift = torch.zeros_like(first)
-        for _ in range(_FOCAL_STEPS):
+        for _ in range(self.settings.focal_steps):
             cells = _per_pair(first * shift.exp() / CELL, pairs)
             gradient, curvature = focal_step(
                 clip.queries,
@@ -241,7 +243,7 @@ class MatchingCameraHead(nn.Module):
         points = _points(clip, depth[:, pairs.source].flatten(0, 1), cells)
         last = estimates.last
         start = last.solution.motion.detach()
-        return solve_motion(points, last.matches, last.trust, cells, start, iterations=_FINAL_ITERATIONS)
+        return solve_motion(points, last.matches, last.trust, cells, start, iterations=self.settings.final_iterations)
 
     def correct_depth(
         self,
@@ -292,14 +294,14 @@ def image_diagonal(height: int, width: int, *, like: Tensor) -> Float[Tensor, ""
     return (sides[0].square() + sides[1].square()).sqrt()
 
 
-def _trajectory(solution: Solution, pairs: ClipPairs) -> Motion:
+def _trajectory(solution: Solution, pairs: ClipPairs, settling: int) -> Motion:
     """Camera-from-first-camera motions from the solutions of a clip's pairs."""
     count = pairs.source.shape[0]
     motion = Motion(
         solution.motion.rotation.unflatten(0, (-1, count)), solution.motion.translation.unflatten(0, (-1, count))
     )
     information = solution.information.unflatten(0, (-1, count))
-    return settle_trajectory(fuse_trajectory(motion, information), motion, information, pairs)
+    return settle_trajectory(fuse_trajectory(motion, information), motion, information, pairs, count=settling)
 
 
 def _per_pair(values: Float[Tensor, "b"], pairs: ClipPairs) -> Float[Tensor, "e"]:

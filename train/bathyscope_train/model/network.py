@@ -164,8 +164,7 @@ def build_camera_head(preset: NetworkPreset) -> nn.Module:
             width,
             stem_channels=2 * _stem_channels(preset),
             patch_size=preset.patch_size,
-            rounds=settings.rounds,
-            iterations=settings.iterations,
+            settings=settings,
         )
     return CameraHead(
         width=width,

@@ -15,13 +15,12 @@ from bathyscope_train.model.pose_layer import Motion, solve_columns
 from bathyscope_train.model.rigid import adjoint, compose, rotate
 from bathyscope_train.model.trajectory import ClipPairs, difference, move
 
-_STEPS = 8
 _HOLD = 1e-3
 _LEAST = 1e-20  # a clamp and not an addition: graph optimisers drop those
 
 
 def settle_trajectory(
-    trajectory: Motion, measured: Motion, information: Float[Tensor, "b e 6 6"], pairs: ClipPairs
+    trajectory: Motion, measured: Motion, information: Float[Tensor, "b e 6 6"], pairs: ClipPairs, *, count: int = 8
 ) -> Motion:
     """The trajectory that agrees best with all measured motions; frame 0 stays the identity.
 
@@ -33,6 +32,7 @@ def settle_trajectory(
         measured: Target-from-source motions, (b, e, ...).
         information: Inverse covariance of each, for (translation, rotation vector) from the left.
         pairs: What was measured.
+        count: Steps of the solver.
     """
     frames = trajectory.translation.shape[1]
     index = torch.arange(frames, device=information.device)
@@ -67,7 +67,7 @@ def settle_trajectory(
     residual = -gather(offset)
     scaled = rotate(preconditioner, residual)
     direction, energy = scaled, (residual * scaled).sum((1, 2), keepdim=True)
-    for _ in range(_STEPS):
+    for _ in range(count):
         image = apply(direction)
         length = energy / (direction * image).sum((1, 2), keepdim=True).clamp_min(_LEAST)
         steps, residual = steps + length * direction, residual - length * image

@@ -72,6 +72,9 @@ class MatchingCameraSettings(BaseModel, frozen=True, extra="forbid"):
     kind: Literal["matching"] = "matching"
     rounds: Repeats = 2
     iterations: Repeats = Field(default=3, description="Solver iterations a round.")
+    focal_steps: Repeats = Field(default=2, description="Corrections of the focal length by the motions.")
+    final_iterations: Repeats = Field(default=2, description="Solver iterations with the corrected depth.")
+    settling: Repeats = Field(default=8, description="Steps that bring all motions of a clip together.")
 
 
 class DptSettings(BaseModel, frozen=True, extra="forbid"):
