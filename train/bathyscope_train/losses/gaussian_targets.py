@@ -38,10 +38,8 @@ def depth_error(
 ) -> Float[Tensor, "b t h w"]:
     """Absolute difference of log depths after removing the clip's median difference; 0 where not valid."""
     difference = (depth.log() - safe_log(true)).detach()
-    aligned = torch.empty_like(difference)
-    for index, (clip, mask) in enumerate(zip(difference, valid, strict=True)):
-        aligned[index] = clip - (clip[mask].median() if mask.any() else 0)
-    return aligned.abs() * valid
+    median = torch.where(valid, difference, torch.nan).flatten(1).nanmedian(1).values[:, None, None, None]
+    return torch.where(valid, (difference - median).abs(), 0)
 
 
 def depth_edges(true: Float[Tensor, "b t h w"], valid: Bool[Tensor, "b t h w"]) -> Bool[Tensor, "b t h w"]:
