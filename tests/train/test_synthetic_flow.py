@@ -165,7 +165,7 @@ def test_tissue_that_moves_by_nothing_gives_the_bytes_of_still_tissue() -> None:
 
 def test_instruments_are_labelled_stand_before_the_tissue_and_are_followed() -> None:
     shares = []
-    for seed in range(6):
+    for seed in range(4):
         clip, bare = (
             render_clip(seed, alive("cavity", instruments=share), frames=4, size=(56, 70)) for share in (1.0, 0.0)
         )

@@ -85,7 +85,7 @@ def test_a_parallel_path_hardly_turns_while_it_travels() -> None:
 
 def test_a_pausing_camera_stops_on_the_path_that_it_would_have_taken() -> None:
     stops = 0
-    for seed in range(6):
+    for seed in range(3):
         free, paused = (path_of(seed, "lumen", speed=(1.0, 1.0), pausing=share) for share in (0.0, 1.0))
         np.testing.assert_allclose(paused[0], free[0], atol=1e-9)
         stops += sum(np.allclose(a, b, atol=1e-9) for a, b in pairwise(paused))
@@ -93,7 +93,7 @@ def test_a_pausing_camera_stops_on_the_path_that_it_would_have_taken() -> None:
             apart = np.linalg.norm(free[:, :3, 3] - pose[:3, 3], axis=1)
             assert apart.min() < 0.6 * np.linalg.norm(np.diff(free[:, :3, 3], axis=0), axis=1).max()
         assert not any(np.allclose(a, b, atol=1e-9) for a, b in pairwise(free))
-    assert stops > 5
+    assert stops > 2
 
 
 def test_a_trembling_hand_adds_turns_of_the_stated_size_and_no_drift() -> None:
