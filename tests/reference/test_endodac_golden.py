@@ -49,7 +49,7 @@ def settings_of(folder: Path) -> DepthSettings:
         channels=tuple(config["out_channels"]),
         adapter=None if lora in (None, "none") else lora,
         rank=config["r"],
-        neck=tuple(config["residual_block_indexes"]),
+        neck=tuple(config.get("residual_block_indexes", ())),
         depth_range=DepthRange(nearest=config["min_depth"], farthest=config["max_depth"]),
     )
 
