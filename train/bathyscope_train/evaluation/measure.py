@@ -1,13 +1,14 @@
 """One system on one sequence under one protocol: numbers for every frame.
 
-Two kinds of pass over the frames are made, each holding one frame (three where neighbours are compared): one or two
-to fit the alignment, and one to measure. What goes wrong with a frame is written into its row, never left out.
+Two kinds of pass over the frames are made: one or two to fit the alignment, and one to measure. Each holds one frame
+and the next, which is read meanwhile; where neighbours are compared, also the two before. What goes wrong with a frame is written into its row, never left out.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,10 +71,20 @@ class _Frames:
             return None
         return frame_pixels(true, self.estimates.read(index), self.scene, self.protocol)
 
+    def ahead(self) -> Iterator[FramePixels | None]:
+        """Every chosen frame in order; the next one is read while the caller works on this one."""
+        with ThreadPoolExecutor(1) as reader:
+            coming: deque[Future[FramePixels | None]] = deque()
+            for index in self.chosen:
+                coming.append(reader.submit(self.load, index))
+                if len(coming) > 1:
+                    yield coming.popleft().result()
+            while coming:
+                yield coming.popleft().result()
+
     def pairs(self) -> Iterator[Pixels]:
         """Pixels of every frame that has any."""
-        for index in self.chosen:
-            pixels = self.load(index)
+        for pixels in self.ahead():
             if pixels is not None and pixels.used.any():
                 yield pixels.pairs()
 
@@ -107,8 +118,8 @@ def measure(
     neighbours = Neighbours(sequence, protocol, frames.scene) if group is None else None
     rows: list[FrameRow] = []
     example: Example | None = None
-    for done, index in enumerate(chosen, 1):
-        row, aligned = _measure_frame(frames, index, alignment, by_depth)
+    for done, (index, pixels) in enumerate(zip(chosen, frames.ahead(), strict=True), 1):
+        row, aligned = _measure_frame(frames, index, pixels, alignment, by_depth)
         rows.append(row)
         if neighbours is not None:
             neighbours.add(rows, aligned)
@@ -137,10 +148,9 @@ def _sequence_alignment(frames: _Frames) -> tuple[Alignment | None, str]:
 
 
 def _measure_frame(
-    frames: _Frames, index: int, alignment: Alignment | None, by_depth: BinnedErrors
+    frames: _Frames, index: int, pixels: FramePixels | None, alignment: Alignment | None, by_depth: BinnedErrors
 ) -> tuple[FrameRow, AlignedFrame | None]:
     name = frames.sequence.frame_names[index]
-    pixels = frames.load(index)
     if pixels is None:
         return FrameRow(index, name, Status.UNREADABLE, note=frames.unreadable[index]), None
     share = float(pixels.counts.mean())
