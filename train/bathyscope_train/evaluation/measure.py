@@ -1,7 +1,8 @@
 """One system on one sequence under one protocol: numbers for every frame.
 
 Two kinds of pass over the frames are made: one or two to fit the alignment, and one to measure. Each holds one frame
-and the next, which is read meanwhile; where neighbours are compared, also the two before. What goes wrong with a frame is written into its row, never left out.
+and the next, which is read meanwhile; where neighbours are compared, also the two before. What goes wrong with a
+frame is written into its row, never left out.
 """
 
 from __future__ import annotations

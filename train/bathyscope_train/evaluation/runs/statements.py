@@ -36,7 +36,8 @@ def data_statement(label: str, chosen: EvaluationSet, lines: Sequence[Line]) -> 
     high = "none" if part.caps[1] is None else f"{part.caps[1]:g}"
     caps = sorted({p.record.groups[group].caps for p in known.parts}, key=str)
     many = f" ({len(caps)} different caps)" if len(caps) > 1 else ""
-    text += f"; caps {part.caps[0]:g} to {high} {part.unit}{many}; true depth at {_percent(known.truth_share)} of the pixels"
+    text += f"; caps {part.caps[0]:g} to {high} {part.unit}{many}"
+    text += f"; true depth at {_percent(known.truth_share)} of the pixels"
     text += f"; {known.frames} frames looked at" if known.frames != chosen.frame_count else ""
     if len(units) > 1:
         text += f"; mixed units ({', '.join(units)}), so Sq Rel and RMSE have no mean"
