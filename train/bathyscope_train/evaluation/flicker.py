@@ -2,9 +2,9 @@ r"""Flicker without poses and without truth: how much log depth at a pixel jerks
 
 .. math:: \text{flicker} = 100\;\mathrm{mean}\,\big|\ln d_{t-1} - 2 \ln d_t + \ln d_{t+1}\big|
 
-A camera that moves evenly changes depth evenly, which a second difference does not see; what remains is depth that goes
-back and forth. One factor for the whole clip does not change it, so it needs no alignment. Edges that move across a pixel
-do count: compare it between systems on the same clip, or with the flicker of the true depth, never with zero.
+A camera that moves evenly changes depth evenly, which a second difference does not see; what remains is depth that
+goes back and forth. One factor for the whole clip does not change it, so it needs no alignment. Edges that move across
+a pixel do count: compare it between systems on the same clip, or with the flicker of the true depth, not with zero.
 """
 
 from __future__ import annotations
