@@ -16,6 +16,7 @@ from bathyscope_train.config import PretrainSettings, SourceSettings, load_setti
 from bathyscope_train.data.synthetic import DOMAINS
 from bathyscope_train.data.synthetic.shards import write_clips
 from bathyscope_train.data.truth_clips import read_truth_clips
+from bathyscope_train.devices import use_bfloat16
 from bathyscope_train.losses.supervised import supervised_objective
 from bathyscope_train.model import Network
 from bathyscope_train.model.checkpoints import load_network, save_checkpoint, training_of
@@ -26,7 +27,7 @@ from bathyscope_train.model.presets import (
     NetworkPreset,
     VitSettings,
 )
-from bathyscope_train.pretrain import METRICS_FILE, WEIGHTS_FILE, draw_pairs, pretrain, training_record, use_bfloat16
+from bathyscope_train.pretrain import METRICS_FILE, WEIGHTS_FILE, draw_pairs, pretrain, training_record
 from bathyscope_train.schedule import ema_decay, learning_rate_factor, source_shares
 from bathyscope_train.training_state import STATE_FILE
 from bathyscope_train.validation import validate

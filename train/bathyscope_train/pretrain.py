@@ -16,14 +16,16 @@ from bathyscope_train.config import PretrainSettings
 from bathyscope_train.curves import draw_curves
 from bathyscope_train.data.measured_clips import read_measured_clips
 from bathyscope_train.data.truth_clips import read_truth_clips
-from bathyscope_train.data.windows import Batch, TruthClip, sample_window, stack
+from bathyscope_train.data.window_sources import WindowSources
+from bathyscope_train.data.windows import TruthClip
+from bathyscope_train.devices import choose_device, use_bfloat16
 from bathyscope_train.losses.supervised import SolverInput, supervised_objective
 from bathyscope_train.model.checkpoints import load_network, save_checkpoint
 from bathyscope_train.model.matching_camera_head import MatchingCameraHead
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import get_preset
 from bathyscope_train.model.trajectory import ClipPairs, clip_pairs
-from bathyscope_train.schedule import ema_decay, learning_rate_factor, source_shares
+from bathyscope_train.schedule import ema_decay, learning_rate_factor
 from bathyscope_train.training_state import read_state, write_state
 from bathyscope_train.validation import Validation, validate, write_grid
 from bathyscope_train.workers import average, launch, share_gradients
@@ -64,12 +66,15 @@ class _Run:
 
     def __init__(self, settings: PretrainSettings, rank: int) -> None:
         self.settings, self.rank = settings, rank
-        self.network = initial_network(settings)
+        self.device = choose_device(settings.device, workers=settings.workers)
+        self.network = initial_network(settings).to(self.device)
         self.average = {name: value.detach().clone() for name, value in self.network.state_dict().items()}
         self.parameters = choose_parameters(self.network, settings.only)
         self.optimizer = torch.optim.AdamW(parameter_groups(self.network, settings), betas=(0.9, 0.98))
         self.position = read_state(settings.out, self.network, self.average, self.optimizer)
-        self.sources: dict[Path, list[TruthClip]] = {}
+        self.sources = WindowSources(
+            settings.data, settings.render, device=self.device, seed=settings.seed, step=self.position.step
+        )
         self.held_out = [held_out_clips(path, settings.validation_clips) for path in settings.validation]
         self.started = time.monotonic() - self.position.elapsed_s
         self.recent: list[Tensor] = []
@@ -78,7 +83,8 @@ class _Run:
         """Take steps until the budget is used up."""
         validated = saved = time.monotonic()
         progress = self.progress()
-        while progress < 1:
+        begun = time.monotonic()
+        while progress < 1 and not self.slice_is_over(begun):
             progress = self.step(progress)
             now = time.monotonic()
             if self.rank == 0 and now - saved > 60 * self.settings.checkpoint_minutes:
@@ -87,10 +93,16 @@ class _Run:
             if self.rank == 0 and self.held_out and now - validated > 60 * self.settings.validate_minutes:
                 self.validate()
                 validated = time.monotonic()
+        self.sources.close()
         if self.rank == 0:
             self.save()
             if self.held_out:
                 self.validate()
+
+    def slice_is_over(self, begun: float) -> bool:
+        """Whether this process has had its time; the same answer in all workers is what one worker is for."""
+        limit = self.settings.slice_minutes
+        return limit is not None and time.monotonic() - begun > 60 * limit
 
     def progress(self) -> float:
         """Share of the budget that is used up."""
@@ -102,13 +114,13 @@ class _Run:
         """One optimiser step; returns the new progress, the same in all workers."""
         settings, step = self.settings, self.position.step
         random = np.random.default_rng([settings.seed, step, self.rank])
-        batch = self.draw_batch(progress, random)
-        pairs = draw_pairs(settings.frames, settings.pairs, random)
+        batch = self.sources.draw(progress, random, settings.batch // settings.workers, frames=settings.frames)
+        pairs = draw_pairs(settings.frames, settings.pairs, random, self.device)
         given = draw_solver_input(random, settings.frames, certain=step < settings.true_focal_steps)
         self.network.train()
         self.optimizer.zero_grad(set_to_none=True)
         objective = supervised_objective(
-            self.network, batch, pairs, settings.loss, given, autocast=use_bfloat16(settings.precision)
+            self.network, batch, pairs, settings.loss, given, autocast=use_bfloat16(settings.precision, self.device)
         )
         objective.total.backward()
         self.position.step += 1
@@ -124,19 +136,6 @@ class _Run:
         self.update_average(step)
         self.report(objective.terms, norm, factor, progress)
         return progress
-
-    def draw_batch(self, progress: float, random: np.random.Generator) -> Batch:
-        """This worker's share of a batch; a folder of clips is read when it is first in use."""
-        shares = source_shares(self.settings.data, progress)
-        for source, share in zip(self.settings.data, shares, strict=True):
-            if share > 0 and source.folder not in self.sources:
-                self.sources[source.folder] = read_truth_clips(source.folder)
-        windows = []
-        for _ in range(self.settings.batch // self.settings.workers):
-            clips = self.sources[self.settings.data[int(random.choice(len(shares), p=shares))].folder]
-            clip = clips[int(random.integers(len(clips)))]
-            windows.append(sample_window(clip, random, frames=self.settings.frames))
-        return stack(windows)
 
     def update_average(self, step: int) -> None:
         """Move the running average of the weights."""
@@ -214,7 +213,8 @@ def training_record(settings: PretrainSettings) -> dict[str, Any]:
     """What a checkpoint says about its making: the settings, with the names of folders but not where they lay."""
     record: dict[str, Any] = json.loads(settings.model_dump_json(exclude={"out"}))
     for source in record["data"]:
-        source["folder"] = Path(source["folder"]).name
+        for kind in ("folder", "domain"):
+            source[kind] = Path(source[kind]).name if source[kind] else None
     record["validation"] = [Path(folder).name for folder in record["validation"]]
     record["initial"] = Path(record["initial"]).name if record["initial"] else None
     return record
@@ -245,12 +245,12 @@ def parameter_groups(network: Network, settings: PretrainSettings) -> list[dict[
     ]
 
 
-def draw_pairs(frames: int, count: int, random: np.random.Generator) -> ClipPairs:
+def draw_pairs(frames: int, count: int, random: np.random.Generator, device: torch.device | None = None) -> ClipPairs:
     """Some of the pairs whose motions the trajectory uses, without repetition."""
     every = clip_pairs(frames)
     usable = np.flatnonzero(every.inside.numpy())
     chosen = torch.from_numpy(np.sort(random.permutation(usable)[:count]))
-    return ClipPairs(every.source[chosen], every.target[chosen], every.inside[chosen])
+    return ClipPairs(*(values[chosen].to(device) for values in (every.source, every.target, every.inside)))
 
 
 def draw_solver_input(random: np.random.Generator, frames: int, *, certain: bool) -> SolverInput:
@@ -263,14 +263,6 @@ def draw_solver_input(random: np.random.Generator, frames: int, *, certain: bool
         true_motion=bool(certain or motion),
         held_out=int(random.integers(frames)),
     )
-
-
-def use_bfloat16(precision: str) -> bool:
-    """Whether the transformer runs in bfloat16; ``auto`` says so on a CPU with matrix units (AMX) only.
-
-    Without them bfloat16 is many times slower than float32.
-    """
-    return precision == "bfloat16" or (precision == "auto" and torch.cpu._is_amx_tile_supported())
 
 
 def summary(result: Validation) -> str:

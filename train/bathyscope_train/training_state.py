@@ -50,10 +50,10 @@ def read_state(
     if not path.exists():
         return Position()
     try:
-        state = torch.load(path, weights_only=True)
+        state = torch.load(path, weights_only=True, map_location="cpu")
         network.load_state_dict(state["network"])
         optimizer.load_state_dict(state["optimizer"])
-        average.update(state["average"])
+        average.update({name: value.to(average[name].device) for name, value in state["average"].items()})
         return Position(state["step"], state["elapsed_s"])
     except (OSError, RuntimeError, KeyError, ValueError, UnpicklingError) as error:
         raise CheckpointError(f"{path}: cannot resume from it ({error}); choose another folder or delete it") from error

@@ -71,7 +71,7 @@ def cut_window(clip: TruthClip, index: Sequence[int]) -> Batch:
     if not valid.any():
         raise DatasetError(f"clip {clip.name}: frames {chosen} have no depth")
     poses = clip.world_from_camera[chosen]
-    return _scaled(
+    return scaled(
         Batch(
             images=clip.frames[chosen][None].float() / 255,
             depth=depth[None],
@@ -89,14 +89,14 @@ def sample_window(
 ) -> Batch:
     """A random window of a clip: stride 1 or 2 or standing still at times, either direction of time, augmented."""
     augmentation = augmentation or Augmentation()
-    batch = cut_window(clip, _draw_index(len(clip.frames), frames, random, augmentation.slow_chance))
+    batch = cut_window(clip, draw_index(len(clip.frames), frames, random, augmentation.slow_chance))
     if random.random() < 0.5:
         batch = mirror(batch, axis=0)
     if random.random() < 0.5:
         batch = mirror(batch, axis=1)
     if random.random() < augmentation.crop_chance:
         batch = crop_centre(batch, float(random.uniform(augmentation.crop, 1.0)))
-    return _recolour(batch, random, augmentation)
+    return recolour(batch, random, augmentation)
 
 
 def stack(windows: Sequence[Batch]) -> Batch:
@@ -105,9 +105,14 @@ def stack(windows: Sequence[Batch]) -> Batch:
     return Batch(*(torch.cat([getattr(window, name) for window in windows]) for name in names))
 
 
+def to_device(batch: Batch, device: torch.device) -> Batch:
+    """The same windows on a device."""
+    return Batch(*(getattr(batch, field.name).to(device) for field in fields(Batch)))
+
+
 def mirror(batch: Batch, *, axis: int) -> Batch:
     """The same world in a mirror: ``axis`` 0 swaps left and right, 1 top and bottom."""
-    flip = torch.eye(4)
+    flip = torch.eye(4).to(batch.world_from_camera)
     flip[axis, axis] = -1
     dim = -1 - axis
     return replace(
@@ -120,15 +125,17 @@ def mirror(batch: Batch, *, axis: int) -> Batch:
     )
 
 
-def crop_centre(batch: Batch, share: float) -> Batch:
+def crop_centre(batch: Batch, share: float | Float[Tensor, "b"]) -> Batch:
     """The central ``share`` of each side, resized to the old size: a narrower field of view, exact truth.
 
-    Images are sampled bilinearly, depth at the nearest pixel.
+    Images are sampled bilinearly, depth at the nearest pixel. A window that would show no depth stays as it is.
     """
     b, t, _, height, width = batch.images.shape
-    x = torch.linspace(-1 + 1 / width, 1 - 1 / width, width) * share
-    y = torch.linspace(-1 + 1 / height, 1 - 1 / height, height) * share
-    grid = torch.stack([x.expand(height, width), y[:, None].expand(height, width)], -1).expand(b * t, -1, -1, -1)
+    share = torch.as_tensor(share, dtype=batch.depth.dtype, device=batch.depth.device).expand(b)
+    x = torch.linspace(-1 + 1 / width, 1 - 1 / width, width, device=share.device)
+    y = torch.linspace(-1 + 1 / height, 1 - 1 / height, height, device=share.device)
+    grid = torch.stack([x.expand(height, width), y[:, None].expand(height, width)], -1)
+    grid = (grid * share[:, None, None, None]).repeat_interleave(t, 0)
     images = F.grid_sample(batch.images.flatten(0, 1), grid, align_corners=False)
     labels = torch.stack([batch.depth, batch.moving.to(batch.depth.dtype)], 2).flatten(0, 1)
     labels = F.grid_sample(labels, grid, mode="nearest", align_corners=False).unflatten(0, (b, t))
@@ -141,19 +148,26 @@ def crop_centre(batch: Batch, share: float) -> Batch:
         focal=batch.focal / share,
         moving=labels[:, :, 1] > 0,
     )
-    return _scaled(cropped) if bool((depth > 0).any()) else batch
+    return choose((depth > 0).flatten(1).any(1), scaled(cropped), batch)
 
 
-def _scaled(batch: Batch) -> Batch:
+def choose(flags: Bool[Tensor, "b"], first: Batch, second: Batch) -> Batch:
+    """Windows of ``first`` where the flag is set, of ``second`` elsewhere."""
+    pairs = [(getattr(first, field.name), getattr(second, field.name)) for field in fields(Batch)]
+    return Batch(*(torch.where(flags.view(-1, *(1,) * (a.ndim - 1)), a, b) for a, b in pairs))
+
+
+def scaled(batch: Batch) -> Batch:
     """Lengths in units of each window's mean depth."""
     count = batch.valid.sum((1, 2, 3)).clamp_min(1)
     mean = batch.depth.sum((1, 2, 3)) / count
+    mean = torch.where(mean > 0, mean, 1.0)
     poses = batch.world_from_camera.clone()
     poses[:, :, :3, 3] /= mean[:, None, None]
     return replace(batch, depth=batch.depth / mean[:, None, None, None], world_from_camera=poses)
 
 
-def _draw_index(length: int, frames: int, random: np.random.Generator, slow_chance: float) -> list[int]:
+def draw_index(length: int, frames: int, random: np.random.Generator, slow_chance: float) -> list[int]:
     """Frame numbers of a window, forwards or backwards in time."""
     if random.random() < slow_chance or length < frames:
         span = int(random.integers(1, min(frames, length) + 1))
@@ -167,10 +181,11 @@ def _draw_index(length: int, frames: int, random: np.random.Generator, slow_chan
     return [int(k) for k in (index if random.random() < 0.5 else index[::-1])]
 
 
-def _recolour(batch: Batch, random: np.random.Generator, augmentation: Augmentation) -> Batch:
-    """One gamma, gain and tint for the whole window."""
-    gamma, gain = random.uniform(*augmentation.gamma), random.uniform(*augmentation.gain)
-    tint = 1 + random.uniform(-augmentation.tint, augmentation.tint, 3)
-    factor = torch.tensor(gain * tint, dtype=torch.float32)[:, None, None]
-    images = (batch.images.clamp_min(1e-4).pow(gamma) * factor).clamp(0, 1)
-    return replace(batch, images=images)
+def recolour(batch: Batch, random: np.random.Generator, augmentation: Augmentation) -> Batch:
+    """One gamma, gain and tint for each window."""
+    count = len(batch.images)
+    gamma, gain = random.uniform(*augmentation.gamma, count), random.uniform(*augmentation.gain, count)
+    tint = 1 + random.uniform(-augmentation.tint, augmentation.tint, (count, 3))
+    exponent = torch.from_numpy(gamma).to(batch.images)[:, None, None, None, None]
+    factor = torch.from_numpy(gain[:, None] * tint).to(batch.images)[:, None, :, None, None]
+    return replace(batch, images=(batch.images.clamp_min(1e-4).pow(exponent) * factor).clamp(0, 1))
