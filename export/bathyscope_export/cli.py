@@ -1,28 +1,40 @@
 """``bathyscope export CHECKPOINT BUNDLE``: turn a checkpoint into a bundle."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bathyscope.errors import BathyscopeError
+from bathyscope.bundle import hash_file
+from bathyscope.errors import BathyscopeError, CheckpointError, SettingsError
+from bathyscope.model_spec import InputSpec
+
+if TYPE_CHECKING:
+    from bathyscope_train.model.network import Network
+    from bathyscope_train.systems.kinds import Kind
 
 app = typer.Typer(add_completion=False)
 _WRONG_USAGE = 2
+_PIXELS, _WINDOW, _OVERLAP = 112 * 140, 8, 2
 
 
 @app.command()
 def export(  # noqa: PLR0917 - typer: one parameter an option
     checkpoint: Annotated[Path, typer.Argument(help="Weights: safetensors or a PyTorch file.")],
     bundle: Annotated[Path, typer.Argument(help="Folder that the bundle becomes.")],
-    preset: Annotated[str | None, typer.Option(help="Network of a checkpoint that does not say: anysplat.")] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="Network of weights that do not tell it by their keys: vda-s-metric, anysplat.")
+    ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the bundle. Default: that of its folder.")] = None,
     version: Annotated[str, typer.Option(help="Version of the bundle.")] = "1",
-    pixels: Annotated[int, typer.Option(min=1, help="Area of a frame that the network works best at.")] = 112 * 140,
-    window: Annotated[int, typer.Option(min=2, help="Frames the network sees at once.")] = 8,
-    overlap: Annotated[int, typer.Option(min=1, help="Frames that neighbouring windows share.")] = 2,
-    licence: Annotated[str, typer.Option(help="Licence of the weights.")] = "Apache-2.0",
+    pixels: Annotated[
+        int | None, typer.Option(min=1, help="Area of a frame that the network works best at. Default: 15680.")
+    ] = None,
+    window: Annotated[int | None, typer.Option(min=2, help="Frames the network sees at once. Default: 8.")] = None,
+    overlap: Annotated[int | None, typer.Option(min=1, help="Frames neighbouring windows share. Default: 2.")] = None,
+    licence: Annotated[str | None, typer.Option(help="Licence of the weights. Default: Apache-2.0.")] = None,
     research_only: Annotated[
         bool, typer.Option("--research-only", help="The weights may not be used otherwise.")
     ] = False,
@@ -38,36 +50,88 @@ def export(  # noqa: PLR0917 - typer: one parameter an option
 ) -> None:
     """Turn a checkpoint into a bundle: ONNX graphs, one weights file, a manifest with hashes and parity.
 
-    The graphs are compared with PyTorch at several clip lengths and sizes; a bundle that differs is not written.
-    Takes minutes. Prints the bundle's path.
+    Takes our own checkpoints and the published weights of AnySplat, VGGT, Video Depth Anything, EndoDAC and EndoDAV,
+    which are told by their keys. The graphs are compared with PyTorch at several clip lengths and sizes; a bundle
+    that differs is not written. Takes minutes. Prints the bundle's path.
     """
-    from bathyscope.model_spec import InputSpec
+    from bathyscope_export.video_writer import VideoBundleSettings, write_video_bundle
     from bathyscope_export.writer import BundleSettings, write_bundle
-    from bathyscope_train.model.checkpoints import load_network, training_of
-    from bathyscope_train.model.presets import get_preset
+    from bathyscope_train.model.checkpoints import training_of
 
+    record = {} if accuracy is None else _read_accuracy(accuracy)
+    called = name or bundle.name
     try:
-        network, report = load_network(checkpoint, None if preset is None else get_preset(preset))
-        if not report.complete:
-            typer.echo(f"bathyscope export: {checkpoint} does not fill the network: {report}", err=True)
-            raise typer.Exit(_WRONG_USAGE)
-        if overlap >= window:
-            raise typer.BadParameter(f"overlap ({overlap}) must be smaller than window ({window})")
-        settings = BundleSettings(
-            name=name or bundle.name,
-            version=version,
-            input=InputSpec(patch=network.preset.patch_size, pixels=pixels, window=window, overlap=overlap),
-            licence=licence,
-            research_only=research_only,
-            half_weights=half_weights,
-            training=training_of(checkpoint),
-            accuracy={} if accuracy is None else _read_accuracy(accuracy),
-        )
-        written = write_bundle(network, bundle, settings, replace=replace, progress=_say)
+        kind = _kind(checkpoint, preset)
+        if kind is not None and kind.video is not None:
+            given = {"--pixels": pixels, "--window": window, "--overlap": overlap, "--licence": licence}
+            _refuse(kind.name, {**given, "--research-only": research_only, "--half-weights": half_weights})
+            digest = hash_file(_file(checkpoint, kind)).sha256
+            video = VideoBundleSettings(called, version, weights_sha256=digest, accuracy=record)
+            written = write_video_bundle(
+                kind.video(checkpoint, kind.name), bundle, video, replace=replace, progress=_say
+            )
+        else:
+            network = _network(checkpoint, preset if kind is None else kind.preset)
+            settings = BundleSettings(
+                name=called,
+                version=version,
+                input=_input(network, pixels or _PIXELS, window or _WINDOW, overlap or _OVERLAP),
+                licence=licence or "Apache-2.0",
+                research_only=research_only,
+                half_weights=half_weights,
+                training=training_of(checkpoint),
+                accuracy=record,
+            )
+            written = write_bundle(network, bundle, settings, replace=replace, progress=_say)
     except BathyscopeError as error:
         typer.echo(f"bathyscope export: {error}", err=True)
         raise typer.Exit(_WRONG_USAGE) from error
     typer.echo(written.folder)
+
+
+def _kind(checkpoint: Path, preset: str | None) -> "Kind | None":
+    """The published network that the weights are; ``None`` for our own, and for a preset that nobody publishes."""
+    from bathyscope_train.model.presets import PRESETS
+    from bathyscope_train.systems.recognition import kind_called, recognise
+
+    wanted = kind_called(preset)
+    if preset is not None and wanted is None:
+        if preset not in PRESETS:
+            raise SettingsError(f"no network {preset!r}; there are {', '.join(sorted(PRESETS))} and those told by keys")
+        return None
+    return recognise(checkpoint, wanted)
+
+
+def _network(checkpoint: Path, preset: str | None) -> "Network":
+    """The checkpoint's network, filled.
+
+    Raises:
+        CheckpointError: If the checkpoint does not fill it.
+    """
+    from bathyscope_train.model.checkpoints import load_network
+    from bathyscope_train.model.presets import get_preset
+
+    network, report = load_network(checkpoint, None if preset is None else get_preset(preset))
+    if not report.complete:
+        raise CheckpointError(f"{checkpoint} does not fill the network: {report}")
+    return network
+
+
+def _input(network: "Network", pixels: int, window: int, overlap: int) -> InputSpec:
+    if overlap >= window:
+        raise typer.BadParameter(f"overlap ({overlap}) must be smaller than window ({window})")
+    return InputSpec(patch=network.preset.patch_size, pixels=pixels, window=window, overlap=overlap)
+
+
+def _refuse(name: str, options: Mapping[str, object]) -> None:
+    """Options that a video network decides itself."""
+    given = [option for option, value in options.items() if value not in (None, False)]
+    if given:
+        raise SettingsError(f"{name} brings its own windows, size and licence; {', '.join(given)} cannot be given")
+
+
+def _file(checkpoint: Path, kind: "Kind") -> Path:
+    return checkpoint / kind.member if checkpoint.is_dir() and kind.member is not None else checkpoint
 
 
 def _read_accuracy(path: Path) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import onnx
 import pytest
 import torch
 from torch import nn
+from typer.testing import CliRunner
 
 from bathyscope.bundle import Bundle
 from bathyscope.clip import Clip
@@ -21,10 +22,11 @@ from bathyscope.keyed_windows import KeyedWindows
 from bathyscope.model_spec import ResizeSpec, VideoSpec
 from bathyscope.vision.shorter_side import to_network
 from bathyscope_export.attention import fused_count
+from bathyscope_export.cli import app
 from bathyscope_export.video_writer import ValueDifference, VideoBundleSettings, compare_video, write_video_bundle
 from bathyscope_train.systems.endodac import DepthNetwork, DepthSettings
 from bathyscope_train.systems.vda.network import VideoDepthAnything
-from bathyscope_train.systems.vda.settings import VdaSettings
+from bathyscope_train.systems.vda.settings import SIZES, VdaSettings
 from bathyscope_train.systems.vda.system import vda_system
 from bathyscope_train.systems.video_networks import VideoNetwork
 
@@ -161,3 +163,18 @@ def test_a_network_of_one_size_takes_single_pictures_of_any(tmp_path: Path) -> N
     for frame, small in zip(depth, disparity, strict=True):
         resized = cv2.resize(small, (60, 40), interpolation=cv2.INTER_LINEAR)
         np.testing.assert_allclose(frame.depth, settings.depth_range.depth(resized), rtol=1e-3)
+
+
+def test_the_command_tells_a_video_network_by_its_keys_and_refuses_what_it_decides_itself(tmp_path: Path) -> None:
+    with torch.device("meta"):
+        state = VideoDepthAnything(SIZES["s"]).state_dict()
+    torch.save({name: torch.zeros(1).expand(value.shape) for name, value in state.items()}, tmp_path / "vda.pth")
+    arguments = [str(tmp_path / "vda.pth"), str(tmp_path / "bundle")]
+    refused = CliRunner().invoke(app, [*arguments, "--window", "16"])
+    assert refused.exit_code == 2
+    assert "vda-s brings its own windows, size and licence; --window cannot be given" in refused.stderr
+    unknown = CliRunner().invoke(app, [*arguments, "--preset", "vda-x"])
+    assert (unknown.exit_code, "no network 'vda-x'" in unknown.stderr) == (2, True)
+    wrong = CliRunner().invoke(app, [*arguments, "--preset", "endodav"])
+    assert (wrong.exit_code, "its tensors are those of vda-s" in wrong.stderr) == (2, True)
+    assert not (tmp_path / "bundle").exists()

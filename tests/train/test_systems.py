@@ -17,6 +17,7 @@ from bathyscope.errors import CheckpointError, SettingsError
 from bathyscope_train.model import Network, get_preset
 from bathyscope_train.model.checkpoints import save_checkpoint
 from bathyscope_train.systems import FrameEstimate, System, SystemOptions, Unavailable, open_system
+from bathyscope_train.systems.recognition import recognise
 from bathyscope_train.systems.registry import SystemName
 from bathyscope_train.systems.vda.network import VideoDepthAnything
 from bathyscope_train.systems.vda.settings import SIZES
@@ -210,6 +211,30 @@ def test_a_zip_that_is_neither_bundle_nor_checkpoint_is_named(tmp_path: Path) ->
         archive.writestr("hello.txt", "hello")
     with pytest.raises(CheckpointError, match="not a PyTorch checkpoint"):
         open_system(str(tmp_path / "a.zip"))
+
+
+@pytest.mark.parametrize(
+    ("keys", "name"),
+    [
+        (("aggregator.camera_token", "point_head.norm.weight"), "vggt"),
+        (("aggregator.camera_token", "gaussian_param_head.norm.weight"), "anysplat"),
+        (("encoder.aggregator.camera_token", "encoder.gaussian_param_head.norm.weight"), "anysplat"),
+        (("model.encoder.aggregator.camera_token", "model.encoder.gaussian_param_head.norm.weight"), "anysplat"),
+    ],
+)
+def test_anysplat_and_vggt_are_told_apart_by_the_gaussian_head(
+    tmp_path: Path, keys: tuple[str, str], name: str
+) -> None:
+    save_file({keys[0]: torch.zeros(1, 2, 1, 1024), keys[1]: torch.zeros(2)}, tmp_path / "a.safetensors")
+    kind = recognise(tmp_path / "a.safetensors")
+    assert kind is not None
+    assert (kind.name, kind.preset) == (name, name)
+
+
+def test_a_system_goes_by_the_name_it_is_given(tmp_path: Path) -> None:
+    path = published(vda("s"), tmp_path / "a.pth")
+    info = opened(f"mine={path}").info
+    assert (info.name, info.details["network"]) == ("mine", "vda-s")
 
 
 def test_a_folder_without_weights_is_named(tmp_path: Path) -> None:

@@ -64,13 +64,19 @@ def has(shapes: Shapes, key: str, *sides: int | None) -> bool:
 
 
 def _is_anysplat(shapes: Shapes) -> bool:
-    return has(shapes, "encoder.aggregator.camera_token", 1, 2, 1, 1024) and any(
-        key.startswith("encoder.gaussian_param_head.") for key in shapes
-    )
+    return _has_aggregator(shapes) and _has_gaussian_head(shapes)
 
 
 def _is_vggt(shapes: Shapes) -> bool:
-    return has(shapes, "aggregator.camera_token", 1, 2, 1, 1024)
+    return _has_aggregator(shapes) and not _has_gaussian_head(shapes)
+
+
+def _has_aggregator(shapes: Shapes) -> bool:
+    return any(has(shapes, f"{prefix}aggregator.camera_token", 1, 2, 1, 1024) for prefix in ("", "encoder."))
+
+
+def _has_gaussian_head(shapes: Shapes) -> bool:
+    return any("gaussian_param_head." in key for key in shapes)
 
 
 def _is_vda(width: int) -> Callable[[Shapes], bool]:

@@ -17,18 +17,22 @@ from __future__ import annotations
 
 import re
 import zipfile
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast, get_args
 
 from bathyscope.bundle import MANIFEST, Bundle, shipped_bundle
-from bathyscope.errors import CheckpointError, SettingsError
+from bathyscope.camera import F64
+from bathyscope.clip import FrameSequence
+from bathyscope.errors import SettingsError
 from bathyscope.result import DepthKind
 from bathyscope_train.systems.baselines import BASELINES
 from bathyscope_train.systems.engine_system import EngineSystem
-from bathyscope_train.systems.kinds import KINDS, Kind, bare
+from bathyscope_train.systems.kinds import KINDS
 from bathyscope_train.systems.options import refuse_options
-from bathyscope_train.systems.system import System, SystemOptions
+from bathyscope_train.systems.recognition import kind_called, recognise
+from bathyscope_train.systems.system import FrameEstimate, System, SystemInfo, SystemOptions
 
 _LABEL = re.compile(r"([A-Za-z0-9][A-Za-z0-9_.+-]*)=(.+)", re.DOTALL)
 
@@ -71,6 +75,24 @@ class SystemName:
         return cls(label, what, depth)
 
 
+@dataclass(frozen=True, slots=True)
+class Labelled:
+    """A system under the name that the user gave it."""
+
+    label: str
+    system: System
+
+    @property
+    def info(self) -> SystemInfo:
+        """What the system says, under the other name."""
+        info = self.system.info
+        return info.model_copy(update={"name": self.label, "details": {**info.details, "network": info.name}})
+
+    def estimate(self, frames: FrameSequence, intrinsics: F64 | None = None) -> Iterator[FrameEstimate]:
+        """See :class:`~bathyscope_train.systems.system.System`."""
+        return self.system.estimate(frames, intrinsics)
+
+
 def known() -> tuple[str, ...]:
     """Every name that needs no path."""
     return (*BASELINES, "shipped", *(kind.name for kind in KINDS))
@@ -100,7 +122,7 @@ def open_system(text: str, options: SystemOptions | None = None) -> System | Una
         return replace(BASELINES[name.what], name=name.label or name.what)
     if name.what == "shipped":
         return EngineSystem.from_bundle(Bundle.open(shipped_bundle()), options, label=name.label)
-    kind = _kind(name.what)
+    kind = kind_called(name.what)
     if kind is not None:
         return Unavailable(name.label or kind.name, f"weights not available: {kind.weights}; give {kind.name}=FILE")
     raise SettingsError(f"{name.what}: no such file or folder, and none of the names {', '.join(known())}")
@@ -109,9 +131,10 @@ def open_system(text: str, options: SystemOptions | None = None) -> System | Una
 def _open_path(path: Path, name: SystemName, options: SystemOptions) -> System:
     if _is_bundle(path):
         return EngineSystem.from_bundle(Bundle.open(path), options, label=name.label)
-    kind = _recognise(path, name)
+    kind = recognise(path, kind_called(name.label))
     if kind is not None:
-        return kind.open(path, kind, options)
+        system = kind.open(path, kind, options)
+        return system if name.label in (None, kind.name) else Labelled(name.label, system)
     from bathyscope_train.systems.networks import open_own
 
     return open_own(path, name.label or path.stem, options)
@@ -124,45 +147,3 @@ def _is_bundle(path: Path) -> bool:
         return False
     with zipfile.ZipFile(path) as archive:
         return MANIFEST in archive.namelist()
-
-
-def _recognise(path: Path, name: SystemName) -> Kind | None:
-    """The kind of published weights at ``path``; ``None`` for a checkpoint that says its own network."""
-    wanted = None if name.label is None else _kind(name.label)
-    if path.is_dir():
-        found = [kind for kind in KINDS if kind.member is not None and (path / kind.member).is_file()]
-        wanted_files = sorted({kind.member for kind in KINDS if kind.member is not None})
-        if not found:
-            raise CheckpointError(f"{path}: neither a bundle ({MANIFEST}) nor weights ({', '.join(wanted_files)})")
-        file = path / cast(str, found[0].member)
-    else:
-        found, file = list(KINDS), path
-    from bathyscope_train.model.checkpoints import names_its_network
-    from bathyscope_train.model.weight_files import open_weights
-
-    weights = open_weights(file)
-    if names_its_network(weights):
-        if wanted is not None:
-            raise CheckpointError(f"{path}: says itself which network it holds; it is no {wanted.name}")
-        return None
-    shapes = {bare(key): shape for key, shape in weights.shapes.items()}
-    fitting = [kind for kind in found if kind.recognises(shapes)]
-    if wanted is not None and wanted not in fitting:
-        what = f"those of {fitting[0].name}" if fitting else f"{len(shapes)} unknown ones, like {next(iter(shapes))}"
-        raise CheckpointError(f"{path}: holds no {wanted.name}: its tensors are {what}")
-    if not fitting:
-        raise CheckpointError(
-            f"{path}: its {len(shapes)} tensors (like {next(iter(shapes))}) are those of no network known here: "
-            f"{', '.join(kind.name for kind in KINDS)}, or a checkpoint that `bathyscope train` wrote"
-        )
-    return wanted or _by_file_name(file, fitting)
-
-
-def _by_file_name(path: Path, kinds: list[Kind]) -> Kind:
-    """Metric and relative weights have the same keys; the published files say it in their names."""
-    metric = [kind for kind in kinds if kind.name.endswith("-metric")]
-    return metric[0] if metric and "metric" in path.stem else kinds[0]
-
-
-def _kind(name: str) -> Kind | None:
-    return next((kind for kind in KINDS if kind.name == name), None)
