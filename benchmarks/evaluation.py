@@ -25,7 +25,7 @@ from bathyscope_train.evaluation.estimates import open_estimates, store_estimate
 from bathyscope_train.evaluation.measure import measure
 from bathyscope_train.evaluation.protocols import PROTOCOLS, named_protocol
 from bathyscope_train.evaluation.sequences import Crop, Unit
-from bathyscope_train.systems.system import FrameEstimate
+from bathyscope_train.systems.system import FrameEstimate, SystemInfo
 
 SIZE = (1024, 1280)
 
@@ -93,8 +93,8 @@ def main() -> None:
     making = (time.process_time() - making) / 5
     with tempfile.TemporaryDirectory() as folder:
         where = Path(folder)
-        shape = (given.frames, height, width)
-        for _ in store_estimates(where, "benchmark", "depth", shape, estimates(sequence, (height, width))):
+        info, shape = SystemInfo(name="made up", quantity="depth", scale="relative"), (given.frames, height, width)
+        for _ in store_estimates(where, "benchmark", info, shape, estimates(sequence, (height, width))):
             pass
         stored = open_estimates(where, "benchmark")
         assert stored is not None

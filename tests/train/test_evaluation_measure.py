@@ -14,9 +14,10 @@ from made_sequences import MadeSequence
 from bathyscope.camera import invert_pose
 from bathyscope.errors import DatasetError, GeometryError, SettingsError
 from bathyscope_train.evaluation.estimates import ArrayEstimates
+from bathyscope_train.evaluation.frame_pixels import FrameValues, Scene, frame_pixels
 from bathyscope_train.evaluation.frame_rows import Status
 from bathyscope_train.evaluation.measure import MEASURED, measure
-from bathyscope_train.evaluation.protocols import COMPATIBLE, PROTOCOLS, Protocol, Quirk, named_protocol
+from bathyscope_train.evaluation.protocols import COMPATIBLE, PROTOCOLS, Protocol, Quirk, changed, named_protocol
 from bathyscope_train.evaluation.resampling import depth_at
 
 PAPER = named_protocol("paper")
@@ -206,3 +207,33 @@ def test_quirks_only_happen_when_asked_for() -> None:
     assert all(protocol.quirks == frozenset() for protocol in PROTOCOLS.values())
     assert named_protocol("paper", ["unguarded"]).quirks == {Quirk.UNGUARDED}
     assert isinstance(named_protocol("paper"), Protocol)
+
+
+def test_a_changed_protocol_says_so_in_its_name_and_hash() -> None:
+    found = changed(PAPER, ["per=frame", "caps=1:100", "crop=published"])
+    assert (found.per, found.caps_mm, found.crop) == ("frame", (1.0, 100.0), True)
+    assert found.name == "paper per=frame caps=1:100 crop=published"
+    assert "for each frame" in found.words()[1]
+    assert found.hash != PAPER.hash
+    assert changed(PAPER, []) == PAPER
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ("scale=1", "no such field"),
+        ("per=clip", "per is one of sequence, frame"),
+        ("caps=9", "LOW:HIGH"),
+        ("caps=9:1", "low"),
+    ],
+)
+def test_changes_that_mean_nothing_are_refused(change: str, says: str) -> None:
+    with pytest.raises(SettingsError, match=says):
+        changed(PAPER, [change])
+
+
+def test_metric_depth_in_metres_is_measured_in_millimetres_without_an_alignment() -> None:
+    values = FrameValues(depth()[0] / 1000, np.ones((H, W), np.bool_), "depth", millimetres=1000.0)
+    protocol = changed(PAPER, ["alignment=none"])
+    scene = Scene.of(MadeSequence(depth()), protocol)
+    assert frame_pixels(depth()[0], values, scene, protocol).depth == pytest.approx(depth()[0], rel=1e-6)

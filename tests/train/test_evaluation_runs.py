@@ -145,6 +145,11 @@ def test_a_stopped_evaluation_goes_on_where_it_stopped(tmp_path: Path, monkeypat
     finished = evaluate(*arguments, "--out", str(tmp_path / "out"))
     assert finished.exit_code == 0, finished.output
     assert done == ["clip0", "clip1", "clip1", "clip2"]
+    records = [
+        json.loads((tmp_path / "out" / "jobs" / "brightness" / "set" / f"clip{n}" / "record.json").read_text())
+        for n in range(3)
+    ]
+    assert [record["predict_ms"] is None for record in records] == [False, True, False]
     straight = evaluate(*arguments, "--out", str(tmp_path / "straight"))
     assert straight.exit_code == 0
     assert rows_of(tmp_path / "out") == rows_of(tmp_path / "straight")
@@ -206,6 +211,28 @@ def test_mixed_units_have_no_mean_of_lengths(tmp_path: Path) -> None:
     assert (values["rmse"], values["sq_rel"]) == (None, None)
     assert values["abs_rel"] > 0
     assert "mixed units (arbitrary, mm)" in (out / "summary.md").read_text()
+
+
+def test_with_the_quirks_of_an_evaluator_its_printed_lines_are_written(tmp_path: Path) -> None:
+    path, out = folder(tmp_path / "clip", empty=(2,)), tmp_path / "out"
+    arguments = ["--protocol", "endodac", "--compat", "endodac", "--change", "per=frame", "caps=1:100"]
+    result = evaluate(*arguments, "--data", f"set={path}", "--systems", "brightness", "--no-plots", "--out", str(out))
+    assert result.exit_code == 0, result.output
+    block = (out / "published.txt").read_text().splitlines()
+    rows = [row for _, row in read_rows(out / "per_frame.csv") if row.pixels]
+    assert block[0] == "brightness on set"
+    assert block[1].startswith(f" Scaling ratios | med: {np.median([row.scale for row in rows]):0.3f} |")
+    assert block[2].startswith(f"mean:&{np.mean([row.abs_rel for row in rows]):12.3f}")
+    assert len(rows) == T - 1
+    assert "quirks" in (out / "summary.md").read_text().lower()
+
+
+def test_depth_that_is_not_metric_is_not_measured_without_an_alignment(tmp_path: Path) -> None:
+    path, out = folder(tmp_path / "clip"), tmp_path / "out"
+    arguments = ["--change", "alignment=none", "--data", f"set={path}", "--systems", "constant", "--no-plots"]
+    result = evaluate(*arguments, "--out", str(out))
+    assert result.exit_code == 1
+    assert "gives relative depth, which needs an alignment" in result.output
 
 
 def test_two_systems_are_compared_frame_by_frame(finished: tuple[Path, Path, Result]) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 
 from typer.core import TyperGroup
 
-MANY = ("--data", "--systems", "--compat")
+MANY = ("--data", "--systems", "--compat", "--change")
 """Options that take all words up to the next option."""
 _WHOLE = {"--data", "--systems", "--protocol"}
 

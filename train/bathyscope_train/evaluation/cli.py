@@ -83,6 +83,9 @@ def run_tables(
     compat: Annotated[
         list[str] | None, typer.Option(help="Quirks of published evaluators: endodav, endodac, vda, or one by name.")
     ] = None,
+    change: Annotated[
+        list[str] | None, typer.Option(help="alignment=, per=, averaging=, caps=LOW:HIGH, resize=, temporal=, crop=.")
+    ] = None,
     corrected: Annotated[Path | None, typer.Option(help="SCARED-C's poses and depth, laid over SCARED.")] = None,
     max_frames: Annotated[int | None, typer.Option(min=1, help="Use only the first frames of each sequence.")] = None,
     keep_predictions: Annotated[bool, typer.Option(help="Keep raw predictions in the folder.")] = False,
@@ -90,13 +93,13 @@ def run_tables(
     plots: Annotated[bool, typer.Option(help="Draw plots and the qualitative picture.")] = True,
 ) -> None:
     """Measure many systems on many data sets under a named protocol; a run that was stopped goes on."""
-    from bathyscope_train.evaluation.protocols import named_protocol
+    from bathyscope_train.evaluation.protocols import changed, named_protocol
     from bathyscope_train.evaluation.runs.names import parse_data, parse_systems
     from bathyscope_train.evaluation.runs.outputs import write_outputs
     from bathyscope_train.evaluation.runs.run import RunRequest, run
 
     request = RunRequest(
-        protocol=named_protocol(protocol, compat or ()),
+        protocol=changed(named_protocol(protocol, compat or ()), change or ()),
         data=tuple(parse_data(data)),
         systems=tuple(parse_systems(systems)),
         out=out,

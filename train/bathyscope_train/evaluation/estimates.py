@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from bathyscope.camera import F64
 from bathyscope.errors import DatasetError, ResultError
 from bathyscope_train.evaluation.frame_pixels import FrameValues, Quantity
-from bathyscope_train.systems.system import FrameEstimate
+from bathyscope_train.evaluation.sequences import MILLIMETRES
+from bathyscope_train.systems.system import FrameEstimate, SystemInfo
 
 _VALUES, _MASKS, _CAMERAS, _FINISHED = "values.f32", "masks.bits", "cameras.npz", "finished.json"
 
@@ -76,6 +77,8 @@ class StoredEstimates:
     world_from_camera: F64 | None
     intrinsics: F64 | None = None
     """(t, 3, 3) at (h, w); ``None`` without cameras."""
+    millimetres: float | None = None
+    """In one unit of predicted depth; ``None`` for depth that is not metric."""
 
     def __len__(self) -> int:
         return self.shape[0]
@@ -86,7 +89,9 @@ class StoredEstimates:
         packed = (h * w + 7) // 8
         values = np.fromfile(self.folder / _VALUES, np.float32, h * w, offset=4 * h * w * index).reshape(h, w)
         mask = np.fromfile(self.folder / _MASKS, np.uint8, packed, offset=packed * index)
-        return FrameValues(values, np.unpackbits(mask, count=h * w).view(np.bool_).reshape(h, w), self.quantity)
+        return FrameValues(
+            values, np.unpackbits(mask, count=h * w).view(np.bool_).reshape(h, w), self.quantity, self.millimetres
+        )
 
 
 def open_estimates(folder: Path, key: str) -> StoredEstimates | None:
@@ -108,23 +113,23 @@ def open_estimates(folder: Path, key: str) -> StoredEstimates | None:
                 raise ResultError(f"{folder / name}: {found} bytes, {size} belong there; remove the folder")
         with np.load(folder / _CAMERAS) as cameras:
             arrays = {name: np.array(cameras[name]) for name in cameras}
-        quantity, segment = about["quantity"], arrays["segment"]
+        quantity, unit, segment = about["quantity"], about["millimetres"], arrays["segment"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ResultError(f"{folder}: {error}; remove the folder to predict again") from error
     return StoredEstimates(
-        folder, (t, h, w), quantity, segment, arrays.get("world_from_camera"), arrays.get("intrinsics")
+        folder, (t, h, w), quantity, segment, arrays.get("world_from_camera"), arrays.get("intrinsics"), unit
     )
 
 
 def store_estimates(
-    folder: Path, key: str, quantity: Quantity, shape: tuple[int, int, int], estimates: Iterable[FrameEstimate]
+    folder: Path, key: str, info: SystemInfo, shape: tuple[int, int, int], estimates: Iterable[FrameEstimate]
 ) -> Iterator[int]:
     """Write predictions as they come; iterate to the end, then they are finished.
 
     Args:
         folder: Where to; what it held is replaced.
         key: Says of what system and sequence these are.
-        quantity: What the values are.
+        info: What the values are.
         shape: (t, h, w): how many frames there must be, and their size.
         estimates: Frames in order.
 
@@ -152,7 +157,9 @@ def store_estimates(
     if count != shape[0]:
         raise DatasetError(f"{shape[0]} frames went in, {count} came back")
     np.savez(folder / _CAMERAS, **cameras.arrays())
-    (folder / _FINISHED).write_text(json.dumps({"key": key, "quantity": quantity, "shape": shape}))
+    unit = None if info.unit is None else MILLIMETRES[info.unit]
+    about = {"key": key, "quantity": info.quantity, "shape": shape, "millimetres": unit}
+    (folder / _FINISHED).write_text(json.dumps(about))
 
 
 @dataclass

@@ -104,6 +104,8 @@ class FrameValues:
     valid: NDArray[np.bool_]
     """(h, w) where the values mean something."""
     quantity: Quantity
+    millimetres: float | None = None
+    """In one unit of predicted depth, where it has one."""
 
 
 def frame_pixels(true: F32 | None, predicted: FrameValues, scene: Scene, protocol: Protocol) -> FramePixels:
@@ -122,6 +124,8 @@ def frame_pixels(true: F32 | None, predicted: FrameValues, scene: Scene, protoco
         values = np.maximum(values, _DISPARITY_FLOOR)
     size = (stored.shape[0], stored.shape[1])
     depth, known = depth_at(values, predicted.valid, predicted.quantity, size, protocol.resize)
+    if predicted.millimetres not in (None, 1.0) and scene.unit == "mm":
+        depth = depth * np.float32(predicted.millimetres)
     if Quirk.HOLES_CLIPPED in protocol.quirks:
         known = np.ones_like(known)
     return FramePixels(metric, scene.caps.inside(metric), depth, known)

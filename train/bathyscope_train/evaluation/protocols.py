@@ -11,7 +11,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from enum import StrEnum
-from typing import Literal
+from typing import Any, Literal, get_args
 
 from bathyscope.errors import SettingsError
 from bathyscope_train.evaluation.depth_alignment import ALIGNMENT_WORDS, AlignmentKind
@@ -114,6 +114,15 @@ class Protocol:
         return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()[:12]
 
 
+_CHOICES: dict[str, dict[str, Any]] = {
+    "alignment": {word: word for word in get_args(AlignmentKind)},
+    "per": {"sequence": "sequence", "frame": "frame"},
+    "averaging": {word: word for word in get_args(Averaging)},
+    "resize": {word: word for word in get_args(Resize)},
+    "temporal": {"endodav": "endodav", "vda": "vda", "none": None},
+    "crop": {"published": True, "none": False},
+}
+"""What fields can be changed to, by the word on the command line."""
 PROTOCOLS: dict[str, Protocol] = {
     protocol.name: protocol
     for protocol in (
@@ -148,6 +157,43 @@ PROTOCOLS: dict[str, Protocol] = {
         ),
     )
 }
+
+
+def changed(protocol: Protocol, changes: Iterable[str]) -> Protocol:
+    """A protocol with fields replaced, which its name then says.
+
+    Args:
+        protocol: To begin with.
+        changes: ``alignment``, ``per``, ``averaging``, ``resize``, ``temporal``, ``crop`` or ``caps`` (in mm,
+            ``LOW:HIGH``), each as ``field=value``.
+
+    Raises:
+        SettingsError: If a field or its value is not known; lists those that are.
+    """
+    values: dict[str, Any] = {}
+    for change in changes:
+        field, _, word = change.partition("=")
+        if field == "caps":
+            values["caps_mm"] = _caps(change, word)
+            continue
+        choices = _CHOICES.get(field)
+        if choices is None:
+            raise SettingsError(f"--change {change}: no such field; there are caps, {', '.join(_CHOICES)}")
+        if word not in choices:
+            raise SettingsError(f"--change {change}: {field} is one of {', '.join(choices)}")
+        values[field] = choices[word]
+    name = " ".join([protocol.name, *changes]) if values else protocol.name
+    return replace(protocol, name=name, **values)
+
+
+def _caps(change: str, word: str) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in word.split(":"))
+    except ValueError as error:
+        raise SettingsError(f"--change {change}: caps are two numbers in mm, LOW:HIGH") from error
+    if not 0 <= low < high:
+        raise SettingsError(f"--change {change}: caps run from low to high, got {low:g} and {high:g}")
+    return low, high
 
 
 def named_protocol(name: str, compat: Iterable[str] = ()) -> Protocol:

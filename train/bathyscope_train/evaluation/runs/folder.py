@@ -9,6 +9,7 @@
                                   poses.txt      predicted cameras in TUM order, where the system has any
     OUT/predictions/...                          raw predictions while a sequence is measured
     OUT/per_frame.csv, per_sequence.csv, summary.md, summary.tex, summary.json, plots/
+    OUT/published.txt                            what public evaluators would have printed, with the quirk student-t
 """
 
 from __future__ import annotations

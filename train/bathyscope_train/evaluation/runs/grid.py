@@ -50,7 +50,7 @@ def draw_grid(path: Path, folder: RunFolder, dataset: str, lines: Sequence[Line]
         shown = {system: found[name] for system, found in examples.items() if name in found}
         top = axes[2 * row * columns : (2 * row + 1) * columns]
         below = axes[(2 * row + 1) * columns : (2 * row + 2) * columns]
-        _row(top, below, f"{dataset}/{name}", shown, [line.system for line in systems])
+        _row(top, below, name if name == dataset else f"{dataset}/{name}", shown, [line.system for line in systems])
     drawn.savefig(path, dpi=100)
     return path
 
@@ -63,7 +63,9 @@ def _row(top: Sequence[Axes], below: Sequence[Axes], name: str, shown: dict[str,
     top[0].set_title(f"{name}\nframe {first.index}", fontsize="small")
     top[1].imshow(np.where(known, first.true, np.nan), vmin=low, vmax=high, cmap="magma_r")
     top[1].set_title("true depth", fontsize="small")
-    below[1].text(0.5, 0.5, f"below: |p - g| / g,\n0 to {WORST:g}", ha="center", va="center", fontsize="small")
+    below[1].text(
+        0.5, 0.5, f"this row: |p - g| / g,\n0 (dark) to {WORST:g}", ha="center", va="center", fontsize="small"
+    )
     for column, system in enumerate(systems, 2):
         if system not in shown:
             continue

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bathyscope.errors import BathyscopeError, DatasetError
+from bathyscope.errors import BathyscopeError, DatasetError, SettingsError
 from bathyscope.tum import tum_lines
 from bathyscope_train.evaluation.estimates import StoredEstimates, open_estimates, store_estimates
 from bathyscope_train.evaluation.evaluate import FRAME_GAP
@@ -85,6 +85,8 @@ def run_job(job: Job, system: System, protocol: Protocol, keep: bool, progress: 
 
 
 def _run(job: Job, system: System, protocol: Protocol, store: Path, progress: Progress) -> SequenceRecord:
+    if protocol.alignment == "none" and system.info.scale != "metric":
+        raise SettingsError(f"{job.system} gives {system.info.scale} {system.info.quantity}, which needs an alignment")
     frames = len(job.sequence)
     what = f"{job.system} on {job.dataset}/{job.sequence.name}"
     estimates, predict_s = _predicted(job, system, store, lambda done: progress(f"{what}: predicting", done, frames))
@@ -132,7 +134,7 @@ def _predicted(
         raise DatasetError(f"{sequence.name}: no frames")
     shape = (len(sequence), *sequence.size)
     start = time.perf_counter()
-    for done in store_estimates(store, key, info.quantity, shape, system.estimate(sequence, sequence.intrinsics)):
+    for done in store_estimates(store, key, info, shape, system.estimate(sequence, sequence.intrinsics)):
         progress(done)
     finished = open_estimates(store, key)
     assert finished is not None

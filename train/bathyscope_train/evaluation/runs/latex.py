@@ -12,7 +12,7 @@ from bathyscope_train.evaluation.runs.statements import (
     data_statement,
     incomplete_statement,
     interval_statement,
-    system_statement,
+    system_statements,
 )
 from bathyscope_train.evaluation.runs.summary import Line
 
@@ -101,5 +101,5 @@ def _notes(outcome: RunOutcome, lines: Sequence[Line]) -> list[str]:
             mine = [line for line in lines if (line.dataset, line.group) == (label, group)]
             sentences.append(data_statement(label, chosen, mine))
             sentences += [text for line in mine if (text := incomplete_statement(line)) is not None]
-    sentences += {line.system: system_statement(line) for line in reversed(lines)}.values()
+    sentences += system_statements(lines)
     return [r"\par\smallskip\footnotesize", *(escaped(sentence) for sentence in sentences)]

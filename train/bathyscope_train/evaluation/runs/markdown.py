@@ -14,7 +14,7 @@ from bathyscope_train.evaluation.runs.statements import (
     data_statement,
     incomplete_statement,
     interval_statement,
-    system_statement,
+    system_statements,
 )
 from bathyscope_train.evaluation.runs.summary import TEMPORAL_COLUMNS, Line
 
@@ -41,9 +41,8 @@ def markdown(outcome: RunOutcome, lines: Sequence[Line], layout: Layout) -> str:
             parts += [text for line in mine if (text := incomplete_statement(line)) is not None]
             parts += [table for table in (_intervals(mine, protocol), _temporal(mine), _cameras(mine)) if table]
     parts.append("## How these numbers came about")
-    systems = {line.system: line for line in reversed(lines)}
     parts.append("\n".join(f"- {text}" for text in (*protocol.words(), interval_statement(protocol))))
-    parts.append("\n".join(f"- {system_statement(line)}" for line in reversed(systems.values())))
+    parts.append("\n".join(f"- {text}" for text in system_statements(lines)))
     if outcome.problems:
         parts.append(f"## What is missing ({len(outcome.problems)})")
         parts.append("\n".join(f"- {problem}" for problem in outcome.problems))

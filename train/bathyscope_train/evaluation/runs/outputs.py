@@ -9,13 +9,14 @@ from pathlib import Path
 
 from bathyscope_train.evaluation.frame_rows import FrameRow, write_rows
 from bathyscope_train.evaluation.intervals import finite_mean
-from bathyscope_train.evaluation.protocols import SEVEN_COLUMNS
+from bathyscope_train.evaluation.protocols import SEVEN_COLUMNS, Quirk
 from bathyscope_train.evaluation.runs.folder import safe, write_json, write_text
 from bathyscope_train.evaluation.runs.grid import draw_grid
 from bathyscope_train.evaluation.runs.latex import latex
 from bathyscope_train.evaluation.runs.layouts import Layout
 from bathyscope_train.evaluation.runs.markdown import markdown
 from bathyscope_train.evaluation.runs.plots import draw_plots
+from bathyscope_train.evaluation.runs.published import published_lines
 from bathyscope_train.evaluation.runs.run import RunOutcome
 from bathyscope_train.evaluation.runs.statements import checkpoint, data_statement, system_statement
 from bathyscope_train.evaluation.runs.summary import TEMPORAL_COLUMNS, Line, summarise
@@ -40,6 +41,8 @@ def write_outputs(outcome: RunOutcome, layout: Layout, *, plots: bool = True) ->
     write_text(folder.path / "summary.md", markdown(outcome, lines, layout))
     write_text(folder.path / "summary.tex", latex(outcome, lines, layout))
     write_json(folder.path / "summary.json", _json(outcome, lines))
+    if Quirk.STUDENT_T in outcome.protocol.quirks:
+        write_text(folder.path / "published.txt", published_lines(lines, outcome.protocol))
     if plots:
         draw_plots(folder.path / "plots", lines)
         for dataset in outcome.data:

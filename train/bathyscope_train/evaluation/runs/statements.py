@@ -71,6 +71,15 @@ def system_statement(line: Line) -> str:
     return f"{text} ({details})." if details else f"{text}."
 
 
+def system_statements(lines: Sequence[Line]) -> list[str]:
+    """One for each system, in the order of the table."""
+    best: dict[str, Line] = {}
+    for line in lines:
+        if line.system not in best or best[line.system].info is None:
+            best[line.system] = line
+    return [system_statement(line) for line in best.values()]
+
+
 def checkpoint(info: SystemInfo | None) -> str:
     """First 12 digits of the hash of the weights; ``none`` for a system that has no weights."""
     if info is None:
