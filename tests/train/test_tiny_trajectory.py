@@ -19,6 +19,7 @@ from bathyscope_train.model.trajectory import (
     GROUPS,
     chain_motions,
     clip_pairs,
+    follow_steps,
     fuse_trajectory,
 )
 
@@ -120,6 +121,19 @@ def test_every_frame_starts_pairs_in_both_directions_of_time_and_a_loop() -> Non
     neighbours = {(k, k + 1) for k in range(7)} | {(k, k - 2) for k in range(2, 8)} | {(k, k + 4) for k in range(4)}
     assert counted == neighbours | {(k, 7 - k) for k in range(8)}
     assert not clip_pairs(1).inside.any()
+
+
+def test_far_pairs_follow_the_steps_between_their_ends() -> None:
+    """Whatever was found for them; near pairs keep what was found."""
+    exact = clip_motions(camera_path(9))
+    found = Motion(exact.rotation.clone(), exact.translation.clone())
+    found.translation[:, 18:] += 5.0
+    followed = follow_steps(found)
+    inside = clip_pairs(9).inside.bool()
+    torch.testing.assert_close(followed.translation[:, inside], exact.translation[:, inside], atol=1e-5, rtol=0)
+    torch.testing.assert_close(followed.rotation[:, inside], exact.rotation[:, inside], atol=1e-5, rtol=0)
+    found.translation[:, :18] += 0.1
+    assert torch.equal(follow_steps(found).translation[:, :18], found.translation[:, :18])
 
 
 def end_error(found: Motion, poses: torch.Tensor) -> torch.Tensor:

@@ -35,6 +35,7 @@ WEIGHTS_FILE = "model.safetensors"
 METRICS_FILE = "metrics.jsonl"
 
 _FOCAL_ERROR = 0.15  # standard deviation of the logarithm
+_HINT_ERROR = 0.3
 
 _log = logging.getLogger(__name__)
 
@@ -255,12 +256,13 @@ def draw_pairs(frames: int, count: int, random: np.random.Generator, device: tor
 
 def draw_solver_input(random: np.random.Generator, frames: int, *, certain: bool) -> SolverInput:
     """What the solver starts from (in half of the steps, and while ``certain``, the truth), and the frame left out."""
-    focal, motion = random.random(2) < 0.5
+    focal, motion, hint = random.random(3) < 0.5
     error = float(np.exp(random.normal(0, _FOCAL_ERROR)))
     return SolverInput(
         true_focal=bool(certain or focal),
         focal_error=error,
         true_motion=bool(certain or motion),
+        hint_error=float(random.uniform(0, _HINT_ERROR)) if hint else None,
         held_out=int(random.integers(frames)),
     )
 

@@ -7,13 +7,15 @@ from pydantic import BaseModel, NonNegativeFloat
 from torch import Tensor
 
 from bathyscope_train.data.windows import Batch
-from bathyscope_train.losses.camera import focal_loss, induced_flow_loss, motion_loss
+from bathyscope_train.losses.camera import focal_loss, induced_flow_loss, length, motion_loss
 from bathyscope_train.losses.depth import confidence_loss, gradient_loss, log_depth_loss, normal_loss, safe_log
 from bathyscope_train.losses.gaussian_targets import gaussian_loss
 from bathyscope_train.losses.held_out_view import held_out_view_loss
 from bathyscope_train.losses.matching import flow_loss, matching_cross_entropy, true_matches
 from bathyscope_train.model.matching_camera_head import MatchingCameraHead, image_diagonal
 from bathyscope_train.model.network import DenseMaps, Features, Network
+from bathyscope_train.model.pose_layer import Motion
+from bathyscope_train.model.rigid import rotation_exponential, rotation_logarithm
 from bathyscope_train.model.trajectory import ClipPairs
 from bathyscope_train.render import CpuRenderer, GsplatRenderer, Renderer
 
@@ -55,6 +57,9 @@ class SolverInput:
     focal_error: float = 1.0
     true_motion: bool = False
     """Correct the depth under the true motions, rather than the estimated ones."""
+    hint_error: float | None = None
+    """Let the last look follow the true motions, each turned and shifted by about this share of itself, as the steps
+    from frame to frame would lead it; None for the motions of the first look."""
     held_out: int = 0
     """Frame that the others' Gaussians have to show."""
 
@@ -117,9 +122,15 @@ def _camera_terms(
     depth = maps.depth.detach()
     clip = head.describe(features.taps[-1], features.stem_maps, depth)
     first = batch.focal if given.true_focal else focal.detach() * given.focal_error
-    estimates = head.estimate(clip, first, pairs)
-    refined = head.refine_focal(clip, estimates, first, pairs)
     true = true_matches(batch, pairs)
+    if given.hint_error is None:
+        estimates = head.estimate(clip, first, pairs)
+    else:
+        hint = disturbed(true.motion, given.hint_error)
+        shape = (batch.focal.shape[0], pairs.source.shape[0])
+        per_clip = Motion(hint.rotation.unflatten(0, shape), hint.translation.unflatten(0, shape))
+        estimates = head.estimate(clip, first, pairs, between=lambda motion: per_clip)
+    refined = head.refine_focal(clip, estimates, first, pairs)
     motion = true.motion if given.true_motion else None
     correction = head.correct_depth(clip, estimates, refined.detach(), pairs, motion=motion)
     corrected = head.corrected(clip, depth, correction)
@@ -138,6 +149,16 @@ def _camera_terms(
         "corrected_depth": log_depth_loss(corrected, batch.depth, batch.valid)
         + 0.5 * gradient_loss(corrected, batch.depth, batch.valid),
     }, corrected
+
+
+def disturbed(motion: Motion, share: float) -> Motion:
+    """Motions with their rotation vectors and translations off by about ``share`` of their lengths."""
+    angles = rotation_logarithm(motion.rotation)
+    wrong = [
+        each + share * length(each)[..., None] * torch.randn_like(each) / 3**0.5
+        for each in (angles, motion.translation)
+    ]
+    return Motion(rotation_exponential(wrong[0]), wrong[1])
 
 
 def splatting(device: torch.device) -> Renderer:

@@ -6,7 +6,7 @@ view begins with what the camera tokens say and is corrected by the motions (:mo
 caller knows it; parallax corrects the depth (:mod:`.depth_refiner`), and the corrected depth the motions.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -30,7 +30,7 @@ from bathyscope_train.model.pose_graph import settle_trajectory
 from bathyscope_train.model.pose_layer import Motion, Solution, project, rays, solve_motion
 from bathyscope_train.model.presets import MatchingCameraSettings
 from bathyscope_train.model.stem import CELL
-from bathyscope_train.model.trajectory import ClipPairs, clip_pairs, fuse_trajectory
+from bathyscope_train.model.trajectory import ClipPairs, clip_pairs, follow_steps, fuse_trajectory
 
 _TYPICAL_FOCAL = 0.45
 _OUTSIDE = 4.0
@@ -151,7 +151,7 @@ class MatchingCameraHead(nn.Module):
         first = self.focal(camera_tokens) * image_diagonal(height, width, like=depth)
         known = first.new_zeros(first.shape) if focal is None else focal
         first = torch.where(known > 0, known, first)
-        estimates = self.estimate(clip, first, pairs)
+        estimates = self.estimate(clip, first, pairs, between=follow_steps)
         refined = self.refine_focal(clip, estimates, first, pairs)
         refined = torch.where(known > 0, known, refined)
         correction = self.correct_depth(clip, estimates, refined, pairs)
@@ -180,8 +180,22 @@ class MatchingCameraHead(nn.Module):
         queries = query_centres(rows, columns, like=depth) - principal
         return Clip(features, size, principal, queries, query_depth(depth))
 
-    def estimate(self, clip: Clip, focal: Float[Tensor, "b"], pairs: ClipPairs) -> PairEstimates:
-        """Motions of p pairs of frames of each clip (e = b p, clip-major), ``focal`` in pixels."""
+    def estimate(
+        self,
+        clip: Clip,
+        focal: Float[Tensor, "b"],
+        pairs: ClipPairs,
+        *,
+        between: Callable[[Motion], Motion] = lambda motion: motion,
+    ) -> PairEstimates:
+        """Motions of p pairs of frames of each clip (e = b p, clip-major).
+
+        Args:
+            clip: Features, queries and their depth.
+            focal: Focal length in pixels.
+            pairs: What is matched.
+            between: What becomes of the motions (b, p, ...) of one round before the next looks where they lead.
+        """
         source, target = pairs.source, pairs.target
         cells = _per_pair(focal / CELL, pairs)
         correlation = self.matcher.correlate(
@@ -197,7 +211,7 @@ class MatchingCameraHead(nn.Module):
         rounds = []
         for index in range(self.settings.rounds):
             if index:
-                motion = motion.detach()
+                motion = _flat(between(_per_clip(motion.detach(), pairs)))
                 low, high = -principal - _OUTSIDE, principal + _OUTSIDE
                 base = torch.minimum(torch.maximum(project(points, motion, cells), low), high) + principal
             matches, trust = self.matcher.correct(correlation, base.detach(), context, distance.log(), position)
@@ -297,11 +311,20 @@ def image_diagonal(height: int, width: int, *, like: Tensor) -> Float[Tensor, ""
 def _trajectory(solution: Solution, pairs: ClipPairs, settling: int) -> Motion:
     """Camera-from-first-camera motions from the solutions of a clip's pairs."""
     count = pairs.source.shape[0]
-    motion = Motion(
-        solution.motion.rotation.unflatten(0, (-1, count)), solution.motion.translation.unflatten(0, (-1, count))
-    )
+    motion = _per_clip(solution.motion, pairs)
     information = solution.information.unflatten(0, (-1, count))
     return settle_trajectory(fuse_trajectory(motion, information), motion, information, pairs, count=settling)
+
+
+def _per_clip(motion: Motion, pairs: ClipPairs) -> Motion:
+    """From (e, ...) to (b, p, ...)."""
+    shape = (-1, pairs.source.shape[0])
+    return Motion(motion.rotation.unflatten(0, shape), motion.translation.unflatten(0, shape))
+
+
+def _flat(motion: Motion) -> Motion:
+    """From (b, p, ...) to (e, ...)."""
+    return Motion(motion.rotation.flatten(0, 1), motion.translation.flatten(0, 1))
 
 
 def _per_pair(values: Float[Tensor, "b"], pairs: ClipPairs) -> Float[Tensor, "e"]:

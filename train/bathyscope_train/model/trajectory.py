@@ -88,6 +88,28 @@ def fuse_trajectory(motion: Motion, information: Float[Tensor, "b e 6 6"]) -> Mo
     return move(correction, chain)
 
 
+def follow_steps(motion: Motion) -> Motion:
+    """The motions of :func:`clip_pairs`, those over four frames and of loops replaced by the steps between their ends.
+
+    What a point of a far frame did may be more than one look can find; the steps from frame to frame lead there.
+
+    Args:
+        motion: Target-from-source motions, (b, 4 t, ...), group-major.
+    """
+    frames = motion.translation.shape[1] // GROUPS
+    index = torch.arange(frames, device=motion.translation.device)
+    arriving = (index - 1).clamp_min(0)
+    path = chain_motions(Motion(motion.rotation[:, arriving], motion.translation[:, arriving]))
+    pairs = clip_pairs(frames, motion.translation.device)
+    source, target = pairs.source[2 * frames :], pairs.target[2 * frames :]
+    back = inverse((path.rotation[:, source], path.translation[:, source]))
+    far = compose((path.rotation[:, target], path.translation[:, target]), back)
+    near = 2 * frames
+    return Motion(
+        torch.cat([motion.rotation[:, :near], far[0]], 1), torch.cat([motion.translation[:, :near], far[1]], 1)
+    )
+
+
 def move(step: Float[Tensor, "*b 6"], motion: Motion) -> Motion:
     """``motion``, then the small motion ``step`` (translation, rotation vector)."""
     turn = rotation_exponential(step[..., 3:])
