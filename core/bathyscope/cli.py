@@ -21,7 +21,7 @@ GROUP = "bathyscope.commands"
 _SUMMARIES = {
     "depth": "Estimate depth and camera poses for a video or a folder of videos.",
     "serve": "Run the depth service.",
-    "evaluate": "Measure a bundle on a data set with ground truth.",
+    "evaluate": "Measure systems on data sets with ground truth, and compare evaluations.",
     "export": "Turn a checkpoint into a bundle.",
     "train": "Train a network.",
     "data": "Check data sets and prepare them.",

@@ -278,5 +278,6 @@ def test_evaluation_needs_no_torch() -> None:
     code = (
         "import sys; sys.modules['torch'] = None\n"
         "import bathyscope_train.evaluation.cli, bathyscope_train.evaluation.tables\n"
+        "import bathyscope_train.evaluation.runs.outputs, bathyscope_train.evaluation.runs.comparison_text\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
