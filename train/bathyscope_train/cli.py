@@ -27,3 +27,7 @@ def train(
     except BathyscopeError as error:
         typer.echo(f"error: {error}", err=True)
         raise typer.Exit(2) from error
+
+
+if __name__ == "__main__":
+    app()
