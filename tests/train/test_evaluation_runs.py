@@ -19,6 +19,7 @@ from bathyscope_train.evaluation.frame_rows import read_rows
 from bathyscope_train.evaluation.runs import jobs
 from bathyscope_train.evaluation.runs.cells import number
 from bathyscope_train.evaluation.runs.names import DataName, parse_systems
+from bathyscope_train.systems.baselines import Baseline
 
 H, W, T = 12, 16, 4
 
@@ -225,6 +226,30 @@ def test_with_the_quirks_of_an_evaluator_its_printed_lines_are_written(tmp_path:
     assert block[2].startswith(f"mean:&{np.mean([row.abs_rel for row in rows]):12.3f}")
     assert len(rows) == T - 1
     assert "quirks" in (out / "summary.md").read_text().lower()
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_systems_are_told_the_camera_matrix_only_when_the_protocol_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, told: bool
+) -> None:
+    heard: list[Any] = []
+    estimate = Baseline.estimate
+
+    def listen(self: Baseline, frames: Any, intrinsics: Any = None) -> Any:
+        heard.append(intrinsics)
+        return estimate(self, frames, intrinsics)
+
+    monkeypatch.setattr(Baseline, "estimate", listen)
+    change = ["--change", "intrinsics=known"] if told else []
+    path = folder(tmp_path / "clip")
+    result = evaluate(
+        *change, "--data", f"set={path}", "--systems", "constant", "--no-plots", "--out", str(tmp_path / "o")
+    )
+    assert result.exit_code == 0, result.output
+    assert len(heard) == 1
+    assert (heard[0] is not None) == told
+    said = "Camera matrix: told" if told else "Camera matrix: not told"
+    assert said in (tmp_path / "o" / "summary.md").read_text()
 
 
 def test_depth_that_is_not_metric_is_not_measured_without_an_alignment(tmp_path: Path) -> None:

@@ -17,7 +17,11 @@ from bathyscope_train.evaluation.runs.layouts import Layout
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-app = typer.Typer(cls=EvaluateGroup, add_completion=False)
+app = typer.Typer(
+    cls=EvaluateGroup,
+    add_completion=False,
+    help="FOLDER... measures a bundle at once (`folders`); --data and --systems make a whole evaluation (`tables`).",
+)
 
 
 class DepthChoice(StrEnum):
@@ -84,7 +88,7 @@ def run_tables(
         list[str] | None, typer.Option(help="Quirks of published evaluators: endodav, endodac, vda, or one by name.")
     ] = None,
     change: Annotated[
-        list[str] | None, typer.Option(help="alignment=, per=, averaging=, caps=LOW:HIGH, resize=, temporal=, crop=.")
+        list[str] | None, typer.Option(help="alignment=, per=, averaging=, caps=LOW:HIGH, resize=, intrinsics=, ...")
     ] = None,
     corrected: Annotated[Path | None, typer.Option(help="SCARED-C's poses and depth, laid over SCARED.")] = None,
     max_frames: Annotated[int | None, typer.Option(min=1, help="Use only the first frames of each sequence.")] = None,

@@ -77,6 +77,8 @@ class Protocol:
     resize: Resize = "as_given"
     crop: bool = False
     """Whether the data set's published crop is cut out of images and truth."""
+    intrinsics: Literal["unknown", "known"] = "unknown"
+    """Whether systems are told the camera matrix of a sequence; those that cannot use it ignore it."""
     temporal: Literal["endodav", "vda"] | None = "endodav"
     """Which temporal error to report where poses are known."""
     scared_split: Literal["video-test", "endovis-test"] = "video-test"
@@ -100,7 +102,8 @@ class Protocol:
             f"Averaging: errors over the pixels of a frame; {AVERAGING_WORDS[self.averaging]}; "
             "frames without true depth are left out and counted.",
             f"Caps: {caps}; truth strictly inside, aligned depth clipped to them.",
-            f"Resizing: {RESIZE_WORDS[self.resize]}. Crop: {'as published' if self.crop else 'none'}.",
+            f"Resizing: {RESIZE_WORDS[self.resize]}. Crop: {'as published' if self.crop else 'none'}. "
+            f"Camera matrix: {'told' if self.intrinsics == 'known' else 'not told'} to systems.",
             f"Pixels without a prediction: {holes}. Temporal: {temporal}.",
         ]
         if self.quirks:
@@ -121,6 +124,7 @@ _CHOICES: dict[str, dict[str, Any]] = {
     "resize": {word: word for word in get_args(Resize)},
     "temporal": {"endodav": "endodav", "vda": "vda", "none": None},
     "crop": {"published": True, "none": False},
+    "intrinsics": {"unknown": "unknown", "known": "known"},
 }
 """What fields can be changed to, by the word on the command line."""
 PROTOCOLS: dict[str, Protocol] = {
@@ -164,8 +168,8 @@ def changed(protocol: Protocol, changes: Iterable[str]) -> Protocol:
 
     Args:
         protocol: To begin with.
-        changes: ``alignment``, ``per``, ``averaging``, ``resize``, ``temporal``, ``crop`` or ``caps`` (in mm,
-            ``LOW:HIGH``), each as ``field=value``.
+        changes: ``alignment``, ``per``, ``averaging``, ``resize``, ``temporal``, ``crop``, ``intrinsics`` or
+            ``caps`` (in mm, ``LOW:HIGH``), each as ``field=value``.
 
     Raises:
         SettingsError: If a field or its value is not known; lists those that are.

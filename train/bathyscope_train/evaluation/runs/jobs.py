@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from bathyscope.camera import F64
 from bathyscope.errors import BathyscopeError, DatasetError, SettingsError
 from bathyscope.tum import tum_lines
 from bathyscope_train.evaluation.estimates import StoredEstimates, open_estimates, store_estimates
@@ -18,7 +19,7 @@ from bathyscope_train.evaluation.frame_rows import write_rows
 from bathyscope_train.evaluation.measure import Measurement, measure
 from bathyscope_train.evaluation.poses import TruePoses, pose_scores
 from bathyscope_train.evaluation.protocols import Protocol
-from bathyscope_train.evaluation.reports import PoseScores
+from bathyscope_train.evaluation.reports import FocalScores, PoseScores
 from bathyscope_train.evaluation.runs.folder import RunFolder, write_text
 from bathyscope_train.evaluation.runs.records import ALL_FRAMES, GroupRecord, SequenceRecord
 from bathyscope_train.evaluation.sequence_views import FRAME_RATE, SequenceView
@@ -89,7 +90,10 @@ def _run(job: Job, system: System, protocol: Protocol, store: Path, progress: Pr
         raise SettingsError(f"{job.system} gives {system.info.scale} {system.info.quantity}, which needs an alignment")
     frames = len(job.sequence)
     what = f"{job.system} on {job.dataset}/{job.sequence.name}"
-    estimates, predict_s = _predicted(job, system, store, lambda done: progress(f"{what}: predicting", done, frames))
+    known = job.sequence.intrinsics if protocol.intrinsics == "known" else None
+    estimates, predict_s = _predicted(
+        job, system, known, store, lambda done: progress(f"{what}: predicting", done, frames)
+    )
     start = time.perf_counter()
     groups = {}
     for group in (ALL_FRAMES, *job.sequence.groups):
@@ -116,17 +120,18 @@ def _run(job: Job, system: System, protocol: Protocol, store: Path, progress: Pr
         info=system.info,
         groups=groups,
         poses=_poses(job, estimates, groups[ALL_FRAMES].scale),
+        focal=_focal(estimates.intrinsics, job.sequence.intrinsics),
         predict_ms=None if predict_s is None else 1e3 * predict_s / frames,
         measure_ms=1e3 * (time.perf_counter() - start) / frames,
     )
 
 
 def _predicted(
-    job: Job, system: System, store: Path, progress: Callable[[int], None]
+    job: Job, system: System, intrinsics: F64 | None, store: Path, progress: Callable[[int], None]
 ) -> tuple[StoredEstimates, float | None]:
     """Predictions, from disk if an earlier call finished them, and the seconds that they took now."""
     sequence, info = job.sequence, system.info
-    key = f"{info.model_dump_json()} {sequence.name} {len(sequence)} {sequence.size} {sequence.crop}"
+    key = f"{info.model_dump_json()} {sequence.name} {len(sequence)} {sequence.size} {sequence.crop} {intrinsics}"
     found = open_estimates(store, key)
     if found is not None:
         return found, None
@@ -134,7 +139,7 @@ def _predicted(
         raise DatasetError(f"{sequence.name}: no frames")
     shape = (len(sequence), *sequence.size)
     start = time.perf_counter()
-    for done in store_estimates(store, key, info, shape, system.estimate(sequence, sequence.intrinsics)):
+    for done in store_estimates(store, key, info, shape, system.estimate(sequence, intrinsics)):
         progress(done)
     finished = open_estimates(store, key)
     assert finished is not None
@@ -168,3 +173,11 @@ def _poses(job: Job, estimates: StoredEstimates, depth_scale: float | None) -> P
     unit = job.sequence.depth_unit
     poses = TruePoses(true, job.sequence.pose_unit, unit if unit == "arbitrary" else "mm")
     return pose_scores(poses, predicted, estimates.segment, FRAME_GAP, depth_scale)
+
+
+def _focal(predicted: F64 | None, true: F64 | None) -> FocalScores | None:
+    """Median over frames of predicted over true focal length."""
+    if predicted is None or true is None:
+        return None
+    ratios = np.median(predicted[:, [0, 1], [0, 1]], axis=0) / true[[0, 1], [0, 1]]
+    return FocalScores(fx_ratio=float(ratios[0]), fy_ratio=float(ratios[1]))

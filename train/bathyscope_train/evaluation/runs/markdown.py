@@ -93,11 +93,14 @@ def _cameras(lines: Sequence[Line]) -> str:
     rows = []
     for line in lines:
         for part in line.parts:
-            poses = part.record.poses
-            if poses is not None and line.group == ALL_FRAMES:
-                cells = [number(getattr(poses, field)) for _, field in _POSES]
-                rows.append([line.system, part.name, poses.unit, *cells])
-    return table(["cameras", "sequence", "unit", *(head for head, _ in _POSES)], rows) if rows else ""
+            poses, focal = part.record.poses, part.record.focal
+            if line.group != ALL_FRAMES or (poses is None and focal is None):
+                continue
+            cells = [NOTHING if poses is None else number(getattr(poses, field)) for _, field in _POSES]
+            ratio = NOTHING if focal is None else f"{focal.fx_ratio:.2f}, {focal.fy_ratio:.2f}"
+            rows.append([line.system, part.name, NOTHING if poses is None else poses.unit, *cells, ratio])
+    head = ["cameras", "sequence", "unit", *(head for head, _ in _POSES), "focal / true (x, y)"]
+    return table(head, rows) if rows else ""
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

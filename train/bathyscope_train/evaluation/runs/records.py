@@ -8,7 +8,7 @@ from pydantic import BaseModel, ValidationError
 
 from bathyscope.errors import ResultError
 from bathyscope_train.evaluation.measure import MEASURED
-from bathyscope_train.evaluation.reports import PoseScores
+from bathyscope_train.evaluation.reports import FocalScores, PoseScores
 from bathyscope_train.systems.system import SystemInfo
 
 ALL_FRAMES = "all"
@@ -42,6 +42,7 @@ class SequenceRecord(BaseModel, frozen=True, extra="forbid"):
     """Why there is no prediction; such a record is tried again."""
     groups: dict[str, GroupRecord] = {}
     poses: PoseScores | None = None
+    focal: FocalScores | None = None
     predict_ms: float | None = None
     """Per frame."""
     measure_ms: float | None = None
