@@ -29,6 +29,30 @@ def masks(source: Any, bound: Any, out: Any) -> None:
         out[at // 8] = lanes.bits(load(source, at) >= bound)
 
 
+@kernel
+def sums_of_eight(source: Any, out: Any) -> None:
+    rows = (
+        lanes.sums(
+            load(source, 0),
+            load(source, 8),
+            load(source, 16),
+            load(source, 24),
+            load(source, 32),
+            load(source, 40),
+            load(source, 48),
+            load(source, 56),
+        ),
+    )
+    store(out, 0, rows[0])
+
+
+def test_eight_sums_come_in_the_order_of_the_arguments() -> None:
+    numbers = np.random.default_rng(0).integers(0, 1000, (8, 8)).astype(np.float32)
+    found = np.empty(8, np.float32)
+    sums_of_eight(numbers, found)
+    assert found.tolist() == numbers.sum(1).tolist()
+
+
 def test_powers_of_two_are_right_to_rounding() -> None:
     exponents = np.linspace(-30, 3, 8000, dtype=np.float32)
     found = np.empty_like(exponents)
