@@ -186,6 +186,24 @@ def test_threads_share_the_views_and_repeat_themselves() -> None:
         torch.testing.assert_close(two[0][name], one[name], rtol=1e-4, atol=1e-4 * float(one[name].abs().max()))
 
 
+def test_a_rendering_keeps_its_images_and_nothing_that_grows_with_views_times_gaussians() -> None:
+    count, frames, size = 2000, 6, (8, 8)
+    leaves = {name: leaf.requires_grad_() for name, leaf in made(count=count, frames=frames).items()}
+    inputs = {leaf.untyped_storage().data_ptr() for leaf in leaves.values()}
+    kept: dict[int, int] = {}
+
+    def keep(tensor: Tensor) -> Tensor:
+        storage = tensor.untyped_storage()
+        if storage.data_ptr() not in inputs:
+            kept[storage.data_ptr()] = storage.nbytes()
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+        scene = GaussianBatch(*(leaves[name] for name in FIELDS))
+        CpuRenderer().from_cameras(scene, leaves["poses"], leaves["intrinsics"], size)
+    assert sum(kept.values()) < 20 * 4 * frames * size[0] * size[1] < 4 * count * frames
+
+
 def test_spare_memory_bounds_the_threads() -> None:
     renderer = CpuRenderer(threads=8, spare_memory=100)
     assert renderer.workers(16, 40) == 3
