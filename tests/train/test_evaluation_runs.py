@@ -288,6 +288,20 @@ def test_two_systems_are_compared_frame_by_frame(finished: tuple[Path, Path, Res
     assert "No difference can be told." in same.output
 
 
+def test_a_comparison_counts_frames_of_one_side_and_refuses_other_protocols(tmp_path: Path) -> None:
+    path, outs = folder(tmp_path / "clip"), [tmp_path / name for name in "abc"]
+    common = ["--data", f"set={path}", "--systems", "constant", "--no-plots", "--out"]
+    assert evaluate(*common, str(outs[0])).exit_code == 0
+    assert evaluate("--protocol", "endodav", "--change", "alignment=scale", *common, str(outs[1])).exit_code == 0
+    other = evaluate("diff", str(outs[0]), str(outs[1]))
+    assert "different protocols" in str(other.exception)
+    (path / "depth" / "1.png").unlink()
+    assert evaluate(*common, str(outs[2])).exit_code == 0
+    found = evaluate("diff", str(outs[0]), str(outs[2]))
+    assert f"{T - 1} frames were measured by both; 1 only by the first, 0 only by the second" in found.output
+    assert "One sequence says nothing about others." in found.output
+
+
 def test_comparison_needs_to_know_which_system(finished: tuple[Path, Path, Result]) -> None:
     _, out, _ = finished
     found = evaluate("diff", str(out), str(out))
