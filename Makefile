@@ -40,7 +40,7 @@ train-gpu-slice:
 		|| exit 1; done
 	$(TRAINER) -m bathyscope_train.cli configs/pretrain_gpu.yaml out=$(RUN) $(TRAIN)
 	$(if $(OUT),$(TRAINER) -m bathyscope_train.weight_parts split $(RUN)/model.safetensors $(OUT))
-	$(if $(OUT),cp $(RUN)/metrics.jsonl $(RUN)/validation.png $(OUT)/)
+	$(if $(OUT),cp $(RUN)/metrics.jsonl $(RUN)/validation.png $(RUN)/curves.png $(OUT)/)
 
 check: .venv/installed
 	$(BIN)/ruff check --quiet .
