@@ -23,7 +23,7 @@ from bathyscope.clip import FrameSequence
 from bathyscope.errors import SettingsError
 from bathyscope.model_spec import ModelSpec
 from bathyscope.result import BundleId, DepthKind, FrameDepth, ResultMeta
-from bathyscope.scene import WindowMaps
+from bathyscope.scene import Scene, WindowMaps
 
 ENGINE_GROUP = "bathyscope.engines"
 F32 = NDArray[np.float32]
@@ -156,10 +156,24 @@ class Engine(Protocol):
         ...
 
 
+class SceneEngine(Engine, Protocol):
+    """An engine that hands out the scene itself too."""
+
+    def scene(self, frames: FrameSequence, options: DepthOptions = ...) -> Scene:
+        """Cameras (intrinsics at the size of the frames) and Gaussians of a few frames in one world, seen all at once.
+
+        Memory grows with the number of frames. The world is the first frame's camera.
+
+        Raises:
+            SettingsError: If the network has no Gaussians.
+        """
+        ...
+
+
 class EngineFactory(Protocol):
     """What an entry point of the group ``bathyscope.engines`` names."""
 
-    def __call__(self, bundle: Bundle | ModelInMemory, /) -> Engine:
+    def __call__(self, bundle: Bundle | ModelInMemory, /) -> SceneEngine:
         """Load a bundle, or take a network that is loaded already, with the engine's default settings."""
         ...
 

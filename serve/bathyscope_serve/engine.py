@@ -8,14 +8,15 @@ from typing import cast
 import numpy as np
 
 from bathyscope.bundle import Bundle
-from bathyscope.clip import Clip
+from bathyscope.clip import Clip, FrameSequence
 from bathyscope.engines import DepthOptions, ModelInMemory, VideoModel, WindowModel
 from bathyscope.errors import SettingsError
 from bathyscope.model_spec import InputSpec, ModelSpec
 from bathyscope.result import ClipDepth
+from bathyscope.scene import Scene
 from bathyscope_serve.engine_settings import EngineSettings
 from bathyscope_serve.runtime import OnnxModel, OnnxVideoModel
-from bathyscope_serve.scene_session import SceneSession
+from bathyscope_serve.scene_session import SceneSession, scene_of_frames
 from bathyscope_serve.session import DepthSession, Job, Source
 from bathyscope_serve.video_session import VideoSession
 
@@ -64,6 +65,17 @@ class DepthEngine:
         if spec.scene is not None:
             return SceneSession(job, cast(WindowModel, self.model), spec.scene, self.renderers.map)
         return VideoSession(job, cast(VideoModel, self.model), spec)
+
+    def scene(self, frames: FrameSequence, options: DepthOptions | None = None) -> Scene:
+        """Cameras and Gaussians of a few frames in one world, seen all at once; see :class:`bathyscope.engines.Engine`.
+
+        Raises:
+            SettingsError: If the network has no Gaussians.
+        """
+        spec = self.bundle.manifest
+        if spec.scene is None:
+            raise SettingsError(f"{spec.name} is a video network: it has no scene")
+        return scene_of_frames(frames, cast(WindowModel, self.model), spec.scene, self.input, options or DepthOptions())
 
     def depth_of(self, source: Source, options: DepthOptions | None = None, *, name: str | None = None) -> ClipDepth:
         """The whole result in memory: for short clips.

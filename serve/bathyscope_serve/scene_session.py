@@ -7,14 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from bathyscope.engines import WindowModel
+from bathyscope.clip import FrameSequence
+from bathyscope.engines import DepthOptions, WindowModel
 from bathyscope.errors import SettingsError
-from bathyscope.model_spec import SceneSpec
+from bathyscope.model_spec import InputSpec, SceneSpec
 from bathyscope.result import DepthKind, FrameDepth, ResultMeta
-from bathyscope.scene import with_focal
-from bathyscope.vision.field_of_view import FieldOfView
+from bathyscope.scene import Cameras, Scene, assemble_scene, with_focal
+from bathyscope.vision.field_of_view import FieldOfView, find_field_of_view
 from bathyscope.vision.grid import Grid
-from bathyscope_serve.frames import FrameSource
+from bathyscope_serve.frames import FrameSource, SequenceSource
 from bathyscope_serve.session import DepthSession, Job, SmallFrame
 from bathyscope_serve.stitch import SmallDepth, Stitcher
 from bathyscope_serve.window_depth import Map, render_window
@@ -51,14 +52,6 @@ class SceneSession(DepthSession):
         finally:
             self._warnings.extend(stitcher.warnings)
 
-    def _known_focal(self, grid: Grid) -> float | None:
-        """Focal length in pixels of the network, where the caller knows the camera; it has one for both axes."""
-        known = self._job.options.known_intrinsics
-        if known is None:
-            return None
-        small = grid.intrinsics_to_model(known)
-        return float(np.sqrt(small[0, 0] * small[1, 1]))
-
     def _stitched(self, source: FrameSource, grid: Grid, stitcher: Stitcher) -> Iterator[SmallDepth]:
         """Frames of the result at the network's size, as they become final."""
         wanted = self._job.input
@@ -72,7 +65,7 @@ class SceneSession(DepthSession):
 
     def _depth(self, window: Window[SmallFrame], grid: Grid) -> list[SmallDepth]:
         images = np.stack([frame.image for frame in window.items])
-        focal = self._known_focal(grid)
+        focal = known_focal(self._job.options, grid)
         with self._timed("network"):
             maps = self._model.predict(images, self._checkpoint, focal=focal)
         if focal is not None:
@@ -100,6 +93,39 @@ class SceneSession(DepthSession):
             )
             for frame, view in zip(window.items, views, strict=True)
         ]
+
+
+def scene_of_frames(
+    frames: FrameSequence, model: WindowModel, spec: SceneSpec, wanted: InputSpec, options: DepthOptions
+) -> Scene:
+    """Cameras, with intrinsics at the size of the frames, and Gaussians of a few frames that are seen all at once.
+
+    Raises:
+        SettingsError: If the network has no Gaussians.
+        GeometryError: If its output is no scene.
+    """
+    if not spec.gaussians:
+        raise SettingsError("this network has no Gaussians, and so no scene")
+    field_of_view = find_field_of_view(SequenceSource(frames).survey().brightest)
+    grid = Grid.fit(field_of_view, wanted)
+    images = np.stack([grid.to_model(frames.image(index)) for index in range(len(frames))])
+    focal, known = known_focal(options, grid), options.known_intrinsics
+    maps = model.predict(images, focal=focal)
+    if focal is not None:
+        maps = with_focal(maps, focal, spec.focal_epsilon)
+    scene = assemble_scene(maps, images, spec, valid=np.broadcast_to(grid.inside, maps.depth.shape))
+    intrinsics = grid.intrinsics_to_source(scene.cameras.intrinsics)
+    if known is not None:
+        intrinsics = np.tile(known, (len(frames), 1, 1))
+    return Scene(Cameras(scene.cameras.world_from_camera, intrinsics), scene.gaussians)
+
+
+def known_focal(options: DepthOptions, grid: Grid) -> float | None:
+    """Focal length in pixels of the network, where the caller knows the camera; it has one for both axes."""
+    if options.known_intrinsics is None:
+        return None
+    small = grid.intrinsics_to_model(options.known_intrinsics)
+    return float(np.sqrt(small[0, 0] * small[1, 1]))
 
 
 def _depth_kind(job: Job, scene: SceneSpec) -> DepthKind:

@@ -131,6 +131,11 @@ def test_known_intrinsics_are_of_no_use_without_cameras(tmp_path: Path) -> None:
         engine(tmp_path, DISPARITY).run(slopes(2), DepthOptions(intrinsics="50,50,30,20"))
 
 
+def test_a_video_network_has_no_scene(tmp_path: Path) -> None:
+    with pytest.raises(SettingsError, match="made video is a video network: it has no scene"):
+        engine(tmp_path, DISPARITY).scene(slopes(2))
+
+
 def test_windows_of_a_video_network_cannot_be_changed(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="made video is a video network: window cannot be changed"):
         engine(tmp_path, DISPARITY, EngineSettings(window=16))

@@ -19,6 +19,7 @@ from bathyscope_train.model.checkpoints import save_checkpoint
 from bathyscope_train.systems import FrameEstimate, System, SystemOptions, Unavailable, open_system
 from bathyscope_train.systems.recognition import recognise
 from bathyscope_train.systems.registry import SystemName
+from bathyscope_train.systems.system import SceneSystem
 from bathyscope_train.systems.vda.network import VideoDepthAnything
 from bathyscope_train.systems.vda.settings import SIZES
 
@@ -106,6 +107,12 @@ def test_a_bundle_runs_on_the_installed_engine(clip: Clip) -> None:
     system = opened(str(shipped_bundle()))
     assert system.info.weights_sha256 == hash_file(shipped_bundle() / "bundle.json").sha256
     assert_scene(list(system.estimate(clip)), clip)
+    assert isinstance(system, SceneSystem)
+    assert system.info.gaussians
+    scene = system.scene(clip)
+    assert len(scene.gaussians) > 1000
+    assert scene.cameras.world_from_camera.shape == (len(clip), 4, 4)
+    assert scene.cameras.intrinsics[0, 0, 2] == pytest.approx(clip.size[1] / 2, abs=1)
     zipped = opened("shipped@accumulated")
     assert zipped.info.details["depth"] == "accumulated"
     accumulated = next(iter(zipped.estimate(clip)))

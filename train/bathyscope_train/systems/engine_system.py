@@ -12,9 +12,10 @@ import numpy as np
 from bathyscope.bundle import Bundle
 from bathyscope.camera import F64
 from bathyscope.clip import FrameSequence
-from bathyscope.engines import DepthOptions, Engine, engine_factory
+from bathyscope.engines import DepthOptions, SceneEngine, engine_factory
 from bathyscope.errors import ClipError
 from bathyscope.model_spec import ModelSpec
+from bathyscope.scene import Scene
 from bathyscope_train.systems.options import refuse_options
 from bathyscope_train.systems.system import FrameEstimate, SystemInfo, SystemOptions
 
@@ -25,7 +26,7 @@ _log = logging.getLogger(__name__)
 class EngineSystem:
     """An engine with a model in it."""
 
-    engine: Engine
+    engine: SceneEngine
     info: SystemInfo
     options: SystemOptions
 
@@ -69,6 +70,10 @@ class EngineSystem:
         if count != len(frames):
             raise ClipError(f"{frames.name}: {len(frames)} frames went in, {count} came back: {'; '.join(warnings)}")
 
+    def scene(self, frames: FrameSequence, intrinsics: F64 | None = None) -> Scene:
+        """See :class:`~bathyscope_train.systems.system.SceneSystem`."""
+        return self.engine.scene(frames, DepthOptions(intrinsics=_four_numbers(intrinsics)))
+
 
 def _four_numbers(intrinsics: F64 | None) -> str | None:
     """As the engine's options take them."""
@@ -87,6 +92,7 @@ def describe(spec: ModelSpec, name: str, digest: str, options: SystemOptions) ->
         scale="relative" if video is None else video.scale,
         unit="mm" if video is not None and video.scale == "metric" else None,
         confidence="confidence" in spec.outputs,
+        gaussians="gaussians" in spec.outputs,
         cameras="cameras" in spec.outputs,
         weights_sha256=digest,
         licence=spec.licence,

@@ -85,12 +85,21 @@ class Labelled:
     @property
     def info(self) -> SystemInfo:
         """What the system says, under the other name."""
-        info = self.system.info
-        return info.model_copy(update={"name": self.label, "details": {**info.details, "network": info.name}})
+        return _renamed(self.system.info, self.label)
 
     def estimate(self, frames: FrameSequence, intrinsics: F64 | None = None) -> Iterator[FrameEstimate]:
         """See :class:`~bathyscope_train.systems.system.System`."""
         return self.system.estimate(frames, intrinsics)
+
+
+def _labelled(system: System, label: str) -> System:
+    if isinstance(system, EngineSystem):
+        return replace(system, info=_renamed(system.info, label))
+    return Labelled(label, system)
+
+
+def _renamed(info: SystemInfo, label: str) -> SystemInfo:
+    return info.model_copy(update={"name": label, "details": {**info.details, "network": info.name}})
 
 
 def known() -> tuple[str, ...]:
@@ -134,7 +143,7 @@ def _open_path(path: Path, name: SystemName, options: SystemOptions) -> System:
     kind = recognise(path, kind_called(name.label))
     if kind is not None:
         system = kind.open(path, kind, options)
-        return system if name.label in (None, kind.name) else Labelled(name.label, system)
+        return system if name.label in (None, kind.name) else _labelled(system, name.label)
     from bathyscope_train.systems.networks import open_own
 
     return open_own(path, name.label or path.stem, options)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,8 @@ from pydantic import BaseModel, Field, PositiveInt
 
 from bathyscope.camera import F64
 from bathyscope.clip import FrameSequence
-from bathyscope.gaussians import Gaussians
 from bathyscope.result import DepthKind
+from bathyscope.scene import Scene
 
 F32 = NDArray[np.float32]
 Quantity = Literal["depth", "disparity"]
@@ -42,7 +42,7 @@ class SystemInfo(BaseModel, frozen=True, extra="forbid"):
     unit: Literal["mm", "m"] | None = Field(default=None, description="Of metric depth.")
     confidence: bool = False
     cameras: bool = Field(default=False, description="Whether frames come with poses and intrinsics.")
-    gaussians: bool = Field(default=False, description="Whether frames come with the scene they were rendered from.")
+    gaussians: bool = Field(default=False, description="Whether it is a :class:`SceneSystem`, and gives Gaussians.")
     weights_sha256: str | None = Field(
         default=None, description="Of the checkpoint, or of a bundle's manifest (which names the hash of every file)."
     )
@@ -66,8 +66,6 @@ class FrameEstimate:
     """(4, 4) in the world of the segment's first frame; None if the system has no cameras."""
     intrinsics: F64 | None = None
     """(3, 3) pixels at the size of the frames; None if the system has no cameras."""
-    gaussians: Gaussians | None = None
-    """The scene that this frame was rendered from, in the frame's segment's world; None if the system has none."""
     segment: int = 0
     """Frames of one segment share world and scale."""
 
@@ -89,5 +87,18 @@ class System(Protocol):
 
         Raises:
             BathyscopeError: If a frame cannot be read, or the system cannot work on frames of this size.
+        """
+        ...
+
+
+@runtime_checkable
+class SceneSystem(System, Protocol):
+    """A system that builds a scene of Gaussians on its way to depth, and can hand it out."""
+
+    def scene(self, frames: FrameSequence, intrinsics: F64 | None = None) -> Scene:
+        """Cameras (at the size of the frames) and Gaussians of a few frames, seen all at once; memory grows with them.
+
+        Raises:
+            SettingsError: If the system has no Gaussians after all; ``info.gaussians`` tells.
         """
         ...
