@@ -7,6 +7,7 @@
     ├── BundleError       a model bundle that is missing, damaged or not of this format
     ├── CheckpointError   a training checkpoint that cannot be read or does not fit
     ├── DatasetError      a data set folder that is not in the expected layout
+    ├── TrainingError     a training run that cannot go on
     ├── GeometryError     arrays whose shape or values break a geometric contract
     ├── SettingsError     settings that contradict each other or are out of range
     ├── ResultError       a result file that is damaged or of another format
@@ -34,6 +35,10 @@ class CheckpointError(BathyscopeError):
 
 class DatasetError(BathyscopeError):
     """A data set folder that is not in the expected layout."""
+
+
+class TrainingError(BathyscopeError):
+    """A training run that cannot go on: numbers that are not finite, collapsing depth, files that cannot be written."""
 
 
 class GeometryError(BathyscopeError):
