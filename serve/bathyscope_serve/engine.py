@@ -20,6 +20,8 @@ from bathyscope_serve.scene_session import SceneSession, scene_of_frames
 from bathyscope_serve.session import DepthSession, Job, Source
 from bathyscope_serve.video_session import VideoSession
 
+_WARM_UP_PATCHES = 4
+
 
 class DepthEngine:
     """A loaded bundle; safe to use from several threads, one run each.
@@ -48,7 +50,15 @@ class DepthEngine:
         self.renderers = ThreadPoolExecutor(self.settings.render_threads, thread_name_prefix="splat")
 
     def warm_up(self) -> None:
-        """Run a short made-up clip through everything, compiling the splatter on the way."""
+        """Run a short made-up clip through everything, compiling the splatter on the way.
+
+        A video network is only run on two small frames: it compiles nothing, and a window of its own size may take
+        minutes.
+        """
+        if self.bundle.manifest.kind == "video":
+            side = _WARM_UP_PATCHES * self.input.patch
+            cast(VideoModel, self.model).values(np.full((2, 3, side, side), 0.5, np.float32))
+            return
         noise = np.random.default_rng(0).integers(0, 255, (2, 64, 80, 3)).astype(np.uint8)
         self.depth_of(Clip(noise, np.array([0.0, 0.04]), "warm-up"))
 

@@ -133,7 +133,8 @@ def test_frames_are_prepared_as_published(folder: Path) -> None:
 def test_a_long_video_is_the_published_one_from_frames_to_stitched_maps(folder: Path) -> None:
     video = np.load(folder / "video.npz")
     frames = video["frames"]
-    metric = bool(video["metric"]) if "metric" in video else False
+    config = json.loads((folder / "config.json").read_text())
+    metric = bool(video["metric"]) if "metric" in video else bool(config.get("metric", False))
     system = vda_system(network_of(folder), name="golden", metric=metric, input_size=int(video["input_size"]))
     estimates = list(system.estimate(Clip(frames, np.arange(len(frames)) / 25.0)))
     assert [estimate.index for estimate in estimates] == list(range(len(frames)))

@@ -136,6 +136,20 @@ def test_a_video_network_has_no_scene(tmp_path: Path) -> None:
         engine(tmp_path, DISPARITY).scene(slopes(2))
 
 
+def test_warming_up_takes_two_small_frames(tmp_path: Path) -> None:
+    seen: list[tuple[int, ...]] = []
+
+    class Watched:
+        def values(self, images: NDArray[np.float32], checkpoint: object = None) -> NDArray[np.float32]:
+            seen.append(images.shape)
+            return images[:, 0]
+
+    made = engine(tmp_path, DISPARITY)
+    made.model = Watched()  # type: ignore[assignment]
+    made.warm_up()
+    assert seen == [(2, 3, 56, 56)]
+
+
 def test_windows_of_a_video_network_cannot_be_changed(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="made video is a video network: window cannot be changed"):
         engine(tmp_path, DISPARITY, EngineSettings(window=16))

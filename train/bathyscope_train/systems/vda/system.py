@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from bathyscope.bundle import hash_file
+from bathyscope.errors import SettingsError
 from bathyscope.keyed_windows import KeyedWindows
 from bathyscope.vision.shorter_side import network_size, to_network
 from bathyscope_train.model.weight_files import open_weights
@@ -66,8 +67,17 @@ def licence_of(name: str) -> str:
 
 
 def windows_of(network: VideoDepthAnything, *, metric: bool) -> KeyedWindows:
-    """The published windows; metric values are not rescaled from one to the next."""
-    return KeyedWindows(length=network.settings.frames, fit="none" if metric else "references")
+    """The published windows; metric values are not rescaled from one to the next.
+
+    Raises:
+        SettingsError: If the network's position table is shorter than a window.
+    """
+    rule = KeyedWindows(fit="none" if metric else "references")
+    if network.settings.frames < rule.length:
+        raise SettingsError(
+            f"windows have {rule.length} frames, the network knows places for {network.settings.frames}"
+        )
+    return rule
 
 
 def _letter(name: str) -> str:
