@@ -24,6 +24,7 @@ from bathyscope_train.evaluation.vda_errors import inverse_rmse, log10_error, si
 
 REFERENCE = Path(os.environ.get("BATHYSCOPE_REFERENCE", Path(__file__).parents[2] / "../shared/reference"))
 FOLDER = REFERENCE / "evaluation"
+LENGTHS = ("t_gt", "s_gt", "t_pred", "s_pred")
 SEVEN = ("abs_rel", "sq_rel", "rmse", "rmse_log", "delta1", "delta2", "delta3")
 CLOSE: dict[str, Any] = {"rel": 1e-5, "abs": 1e-7, "nan_ok": True}
 
@@ -114,6 +115,7 @@ def check_alignments(found: list[Measurement], expected: list[dict[str, float]])
         else:
             scale = values["s_gt"] / values["s_pred"]
             shift = values["t_gt"] - scale * values["t_pred"]
+            assert part.alignment.lengths == pytest.approx([values[name] for name in LENGTHS], rel=1e-5)
         assert (part.alignment.scale, part.alignment.shift) == pytest.approx((scale, shift), rel=1e-5)
 
 
@@ -139,9 +141,7 @@ def check_printed(found: list[Measurement], expected: dict[str, Any]) -> None:
     if "ratio" in expected["alignment"][0]:
         first = published_text.scaling_line([alignment.scale for alignment in alignments])
     else:
-        names = ("t_gt", "s_gt", "t_pred", "s_pred")
-        lengths = [tuple(values[name] for name in names) for values in expected["alignment"]]
-        first = published_text.shift_line(lengths)
+        first = published_text.shift_line([part.lengths for part in alignments if part.lengths is not None])
     lines = [first, published_text.mean_line(columns), published_text.interval_line(columns)]
     assert lines == expected["printed"]
 

@@ -39,6 +39,8 @@ class Alignment:
     scale: float = 1.0
     shift: float = 0.0
     of_disparity: bool = False
+    lengths: tuple[float, float, float, float] | None = None
+    """What robust scale and shift make equal: median and mean absolute deviation of truth, then of prediction."""
 
     def depth(self, predicted: NDArray[np.floating]) -> NDArray[np.float64]:
         """Aligned depth of predicted depth, of any shape.
@@ -81,8 +83,9 @@ def _scale_shift(pieces: PixelPieces) -> Alignment:
     spread = predicted.mean_absolute_deviation()
     if not (np.isfinite(spread) and spread > 0):
         raise GeometryError("scale and shift need predicted depth that is finite and differs; use scale alone")
-    scale = true.mean_absolute_deviation() / spread
-    return Alignment(scale=scale, shift=true.median() - scale * predicted.median())
+    lengths = (true.median(), true.mean_absolute_deviation(), predicted.median(), spread)
+    scale = lengths[1] / spread
+    return Alignment(scale=scale, shift=lengths[0] - scale * lengths[2], lengths=lengths)
 
 
 def _affine_disparity(pieces: PixelPieces) -> Alignment:

@@ -157,6 +157,7 @@ def _group_record(found: Measurement) -> GroupRecord:
         measured=sum(row.pixels > 0 for row in found.rows),
         scale=None if alignment is None else alignment.scale,
         shift=None if alignment is None else alignment.shift,
+        lengths=None if alignment is None else alignment.lengths,
         by_depth=found.by_depth.as_dict(),
     )
 

@@ -28,16 +28,22 @@ def _lines(line: Line, protocol: Protocol) -> list[str]:
     if protocol.temporal == "endodav":
         pairs = [np.concatenate([part.column(name)[:-1] for part in line.parts]) for name in ("tae", "tas")]
         columns += [pair for pair in pairs if len(pair) and not np.isnan(pair).all()]
-    ratios = _ratios(line, protocol)
-    first = [published_text.scaling_line(ratios)] if ratios else []
-    return [*first, published_text.mean_line(columns), published_text.interval_line(columns)]
+    return [
+        *_first(line, protocol),
+        published_text.mean_line(columns),
+        published_text.interval_line(columns),
+    ]
 
 
-def _ratios(line: Line, protocol: Protocol) -> list[float]:
-    """The factors of frames or sequences, where the alignment is one factor."""
+def _first(line: Line, protocol: Protocol) -> list[str]:
+    """What was fitted, where the alignment is one that is printed."""
+    records = [part.record.groups[line.group] for part in line.parts]
+    if protocol.alignment == "scale_shift" and protocol.per == "sequence":
+        return [published_text.shift_line([record.lengths for record in records if record.lengths is not None])]
     if protocol.alignment != "scale":
         return []
     if protocol.per == "frame":
-        return [row.scale for part in line.parts for row in part.rows if not np.isnan(row.scale)]
-    scales = [part.record.groups[line.group].scale for part in line.parts]
-    return [scale for scale in scales if scale is not None]
+        scales = [row.scale for part in line.parts for row in part.rows if not np.isnan(row.scale)]
+    else:
+        scales = [record.scale for record in records if record.scale is not None]
+    return [published_text.scaling_line(scales)]

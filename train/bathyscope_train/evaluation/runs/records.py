@@ -27,6 +27,8 @@ class GroupRecord(BaseModel, frozen=True, extra="forbid"):
     scale: float | None = None
     """Of the sequence's alignment; null where every frame has its own."""
     shift: float | None = None
+    lengths: tuple[float, float, float, float] | None = None
+    """Of robust scale and shift: median and mean absolute deviation of truth, then of prediction."""
     by_depth: dict[str, list[float]] | None = None
 
 
