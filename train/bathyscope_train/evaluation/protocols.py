@@ -112,7 +112,7 @@ class Protocol:
 
     @property
     def hash(self) -> str:
-        """First 12 hexadecimal digits of the SHA-256 of all that numbers depend on; equal hashes, comparable numbers."""
+        """First 12 digits of the SHA-256 of all that numbers depend on; equal hashes, comparable numbers."""
         fields = asdict(self) | {"quirks": sorted(self.quirks)}
         for told in ("name", "source", "columns"):
             del fields[told]
