@@ -24,7 +24,7 @@ def sequence(root: Path, frames: int = 20, posed: int | None = None) -> Path:
         cv2.imwrite(str(root / "frames" / f"{k:04d}.png"), np.repeat(columns[..., None], 3, -1).astype(np.uint8))
         cv2.imwrite(str(root / "depth" / f"{k:04d}.png"), (columns * 10).astype(np.uint16))
         pose = np.eye(4)
-        pose[0, 3] = k
+        pose[0, 3] = k / 10
         poses.append(f"{k:04d}.png " + " ".join(f"{value:.6f}" for value in pose.ravel()))
     (root / "poses.txt").write_text("\n".join(poses[:posed]))
     calibration = {
@@ -36,6 +36,7 @@ def sequence(root: Path, frames: int = 20, posed: int | None = None) -> Path:
         "cy": CENTRE[1],
         "depth_scale": 0.1,
         "depth_unit": "mm",
+        "pose_unit": "cm",
     }
     (root / "intrinsics.json").write_text(json.dumps(calibration))
     return root
@@ -52,7 +53,7 @@ def test_clips_are_cut_about_the_principal_point_with_their_truth(tmp_path: Path
     expected = left + 2 * np.arange(55) + 1.5  # the mean of two columns; depth is that of one of them
     np.testing.assert_allclose(clip.frames[0, 0, 20].numpy(), expected, atol=0.6)
     np.testing.assert_allclose(clip.depth[0, 20].numpy(), expected, atol=0.51)
-    assert clip.world_from_camera[0, 0, 3] == 2
+    assert clip.world_from_camera[0, 0, 3] == pytest.approx(2)
 
 
 def test_a_sequence_without_poses_is_refused_by_name(tmp_path: Path) -> None:

@@ -61,15 +61,24 @@ class Example:
     true: Float[Tensor, "h w"]
 
 
-def validate(network: Network, clips: Sequence[TruthClip], *, frames: int = 8) -> tuple[Validation, list[Example]]:
-    """Run the network on one window (stride 2 where the clip is long enough) of each clip."""
+def validate(
+    network: Network, clips: Sequence[TruthClip], *, frames: int = 8, known_focal: bool = False
+) -> tuple[Validation, list[Example]]:
+    """Run the network on one window (stride 2 where the clip is long enough) of each clip.
+
+    Args:
+        network: What is measured.
+        clips: With true depth and poses.
+        frames: Length of a window.
+        known_focal: Whether the network is told the focal length.
+    """
     depths, motions, focals, truths, examples = [], [], [], [], []
     was_training = network.training
     network.eval()
     with torch.no_grad():
         for clip in clips:
             batch = cut_window(clip, window_index(len(clip.frames), frames))
-            prediction = network(batch.images)
+            prediction = network(batch.images, batch.focal if known_focal else None)
             depths.append(depth_scores(prediction.maps.depth[0].numpy(), batch.depth[0].numpy()))
             motions.append(motion_scores(prediction, batch))
             focals.append(float(focal_ratio(prediction, batch)))

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from bathyscope.camera import Size
 from bathyscope.errors import DatasetError
 from bathyscope_train.data.windows import TruthClip
+from bathyscope_train.evaluation.folder_sequences import known_unit
 from bathyscope_train.evaluation.folders import DatasetFolder
+from bathyscope_train.evaluation.sequences import MILLIMETRES
 
 _LENGTH = 16
 
@@ -54,13 +56,25 @@ def _clip(folder: DatasetFolder, index: range, size: Size) -> TruthClip:
         rows = (seen.rows.astype(np.float64) + 0.5 - top) * size[0] / height
         columns = (seen.columns.astype(np.float64) + 0.5 - left) * scale
         depths.append(_nearest(rows, columns, seen.depth, size))
+    poses = folder.world_from_camera[list(index)].copy()
+    poses[:, :3, 3] *= _depth_units(folder)
     return TruthClip(
         frames=torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).contiguous(),
         depth=torch.from_numpy(np.stack(depths)),
-        world_from_camera=torch.from_numpy(folder.world_from_camera[list(index)]).float(),
+        world_from_camera=torch.from_numpy(poses).float(),
         focal=float(known[0, 0] * scale),
         name=f"{folder.name}-{index[0]:04d}",
     )
+
+
+def _depth_units(folder: DatasetFolder) -> float:
+    """What a length of the poses is in units of the depth."""
+    depth, pose = known_unit(folder.calibration.depth_unit), known_unit(folder.calibration.pose_unit)
+    if depth == pose:
+        return 1.0
+    if depth not in MILLIMETRES or pose not in MILLIMETRES:
+        raise DatasetError(f"{folder.path}: depth in {depth}, poses in {pose}; how one becomes the other is not known")
+    return MILLIMETRES[pose] / MILLIMETRES[depth]
 
 
 def _centred_crop(intrinsics: NDArray[np.float64], source: Size, size: Size) -> tuple[int, int, int, int]:
