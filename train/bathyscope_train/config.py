@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Literal, Self
 
-import yaml
 from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError, model_validator
 
 from bathyscope.errors import SettingsError
 from bathyscope_train.losses.supervised import LossWeights
+from bathyscope_train.settings_files import read_settings_file
 
 
 class SourceSettings(BaseModel, frozen=True, extra="forbid"):
@@ -47,6 +47,7 @@ class RenderSettings(BaseModel, frozen=True, extra="forbid"):
 class PretrainSettings(BaseModel, frozen=True, extra="forbid"):
     """Supervised pre-training on rendered clips; not in the paper, which starts from published weights."""
 
+    task: Literal["pretrain"] = "pretrain"
     preset: str = "tiny"
     data: tuple[SourceSettings, ...] = Field(min_length=1)
     validation: tuple[Path, ...] = Field(default=(), description="Folders of held-out clips, rendered or measured.")
@@ -107,14 +108,7 @@ def load_settings(path: Path, overrides: Sequence[str] = ()) -> PretrainSettings
     Raises:
         SettingsError: If the file or an override cannot be read, or settings contradict each other.
     """
-    try:
-        values = yaml.safe_load(path.read_text(encoding="utf-8")) or {}
-    except (OSError, yaml.YAMLError) as error:
-        raise SettingsError(f"{path}: cannot read settings: {error}") from error
-    if not isinstance(values, dict):
-        raise SettingsError(f"{path}: settings must be a mapping, got {type(values).__name__}")
-    for override in overrides:
-        _apply(values, override)
+    values = read_settings_file(path, overrides)
     for name, as_source in (("data", True), ("validation", False)):
         if isinstance(values.get(name), str):
             folders = values[name].split(",")
@@ -123,13 +117,3 @@ def load_settings(path: Path, overrides: Sequence[str] = ()) -> PretrainSettings
         return PretrainSettings(**values)
     except ValidationError as error:
         raise SettingsError(f"{path}: {error}") from error
-
-
-def _apply(values: dict[str, Any], override: str) -> None:
-    name, separator, text = override.partition("=")
-    if not separator or not name:
-        raise SettingsError(f"override {override!r} is not of the form name=value")
-    *parents, leaf = name.split(".")
-    for parent in parents:
-        values = values.setdefault(parent, {})
-    values[leaf] = yaml.safe_load(text)

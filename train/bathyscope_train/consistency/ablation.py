@@ -22,6 +22,7 @@ from bathyscope.errors import BathyscopeError, CheckpointError, TrainingError
 from bathyscope_train.consistency.ablation_settings import AblationSettings, load_ablation_settings, run_name
 from bathyscope_train.consistency.ablation_table import Outcome, tables
 from bathyscope_train.consistency.journal import METRICS_FILE
+from bathyscope_train.consistency.plan import make_plan
 from bathyscope_train.consistency.scores import ClipScores, Scores, score_clip, score_network
 from bathyscope_train.consistency.start import load_initial
 from bathyscope_train.consistency.trainer import optimise
@@ -66,6 +67,14 @@ def run_ablation(settings: AblationSettings) -> Path:
     beside.write_text(tables(outcomes, baseline=BASELINE), encoding="utf-8")
     beside.replace(path)
     return path
+
+
+def ablation_plan(settings: AblationSettings) -> str:
+    """What would be done: which runs are left, and the plan of the first."""
+    names = [run_name(variant, seed) for seed in settings.seeds for variant in settings.variants]
+    left = [name for name in names if not (settings.out / name / SCORES_FILE).is_file()]
+    plan = make_plan(settings.run_settings(next(iter(settings.variants)), settings.seeds[0]))
+    return f"{len(left)} of {len(names)} runs are left: {', '.join(left)}\n\nthe first of all\n{plan}"
 
 
 def _run(settings: AblationSettings, variant: str, seed: int, held_out: dict[str, list[TruthClip]]) -> None:
