@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from pydantic import ValidationError
 from safetensors.torch import save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from bathyscope.errors import CheckpointError
 from bathyscope_train.model.network import Network
@@ -94,13 +94,16 @@ def names_its_network(weights: WeightFile) -> bool:
     return _PRESET in weights.metadata
 
 
-def save_checkpoint(network: Network, path: Path | str, *, training: Mapping[str, Any] | None = None) -> None:
-    """Write safetensors that carry the preset and, as JSON, how the weights came about.
+def save_checkpoint(network: nn.Module, path: Path | str, *, training: Mapping[str, Any] | None = None) -> None:
+    """Write safetensors that carry the preset, if it is a network of ours, and, as JSON, how the weights came about.
 
-    Written beside and renamed into place.
+    Others are told by the names of their tensors, as their published weights are. Written beside and renamed into
+    place.
     """
     path = Path(path)
-    metadata = {_PRESET: network.preset.model_dump_json(), _TRAINING: json.dumps(dict(training or {}))}
+    metadata = {_TRAINING: json.dumps(dict(training or {}))}
+    if isinstance(network, Network):
+        metadata[_PRESET] = network.preset.model_dump_json()
     beside = path.with_name(path.name + ".part")
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
     save_file(tensors, beside, metadata=metadata)

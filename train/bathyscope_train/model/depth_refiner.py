@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bathyscope_train.model.correspondence import QUERY_STEP
-from bathyscope_train.model.pose_layer import NOISE_FLOOR, Motion, carry, stacked
+from bathyscope_train.model.pose_layer import NOISE_FLOOR, Motion, linearise
 from bathyscope_train.model.stem import CELL, ResidualConv
 
 _LARGEST_STEP = 1.0
@@ -38,14 +38,11 @@ def parallax(
         focal: Focal length in cells.
         motion: Target-from-source motions.
     """
-    moved = carry(points, motion)
+    line = linearise(points, matches, trust, focal, motion)
     turned = points @ motion.rotation.transpose(-1, -2)
-    position = moved[..., :2] / moved[..., 2:]
-    change = focal[:, None, None] * (turned[..., :2] - position * turned[..., 2:]) / moved[..., 2:]
-    residual = matches - focal[:, None, None] * position
-    weights = stacked(trust)
-    variance = (weights * stacked(residual).square()).sum(-1) / (weights.sum(-1) + 1e-6)
-    scale = (1 / (variance + NOISE_FLOOR))[:, None]
+    change = (line.by_point @ turned[..., None])[..., 0]
+    residual = line.residual.unflatten(1, (-1, 2))
+    scale = (1 / (line.variance + NOISE_FLOOR))[:, None]
     return (trust * change * residual).sum(-1) * scale, (trust * change.square()).sum(-1) * scale
 
 

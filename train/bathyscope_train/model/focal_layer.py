@@ -36,13 +36,12 @@ def focal_step(
     """
     points = rays(queries.expand(*depth.shape, 2), focal[:, None].expand(depth.shape)) * depth[..., None]
     line = linearise(points, matches, trust, focal, motion)
-    x, y = line.moved[..., 0] / line.moved[..., 2], line.moved[..., 1] / line.moved[..., 2]
-    # The point itself moves too: its sideways position is depth * query / focal.
-    sideways = torch.cat([points[..., :2], torch.zeros_like(points[..., :1])], -1)
-    change = -(sideways @ motion.rotation.transpose(-1, -2)) / line.moved[..., 2:]
-    column_x = x + change[..., 0] - x * change[..., 2]
-    column_y = y + change[..., 1] - y * change[..., 2]
-    column = focal[:, None] * torch.cat([column_x, column_y], 1)
+    # The projection is proportional to the focal length, and the point itself moves: its sideways position is
+    # depth * query / focal.
+    sideways = points * points.new_tensor((1.0, 1.0, 0.0))
+    change = sideways @ motion.rotation.transpose(-1, -2)
+    position = focal[:, None, None] * line.moved[..., :2] / line.moved[..., 2:]
+    column = (position - (line.by_point @ change[..., None])[..., 0]).flatten(1)
     count = depth.shape[1]
     weighted = (line.jacobian * line.weights[..., None]).transpose(-1, -2)
     matrix = damped(weighted @ line.jacobian / count)

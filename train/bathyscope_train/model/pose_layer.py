@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bathyscope_train.model.rigid import rotate, rotation_exponential
+from bathyscope_train.model.rigid import cross_matrix, rotate, rotation_exponential
 
 NEAREST = 0.05
 """Smallest depth behind which a projection is cut off, in units of the clip's mean depth."""
@@ -103,10 +103,12 @@ def solve_motion(
 
 @dataclass(frozen=True, slots=True)
 class Linearised:
-    """Projections of n points of each pair and how they change; rows are all x, then all y."""
+    """Projections of n points of each pair and how they change; x and y of each point follow each other."""
 
     moved: Float[Tensor, "e n 3"]
     """The points in the target camera."""
+    by_point: Float[Tensor, "e n 2 3"]
+    """Derivative of the projection by the moved point."""
     residual: Float[Tensor, "e m"]
     """Measured minus projected, in cells; m = 2 n."""
     jacobian: Float[Tensor, "e m 6"]
@@ -128,19 +130,15 @@ def linearise(
 ) -> Linearised:
     """The projections of the points under a motion, to first order."""
     moved = carry(points, motion)
-    inverse = 1 / moved[..., 2]
-    x, y = moved[..., 0] * inverse, moved[..., 1] * inverse
-    residual = target - focal[:, None, None] * torch.stack([x, y], -1)
-    zero, one = torch.zeros_like(x), torch.ones_like(x)
-    row_u = torch.stack([inverse, zero, -x * inverse, -x * y, one + x * x, -y], -1)
-    row_v = torch.stack([zero, inverse, -y * inverse, -one - y * y, x * y, x], -1)
-    jacobian = focal[:, None, None] * torch.cat([row_u, row_v], 1)
-    return Linearised(moved, stacked(residual), jacobian, stacked(weights))
-
-
-def stacked(pairs: Float[Tensor, "e n 2"]) -> Float[Tensor, "e m"]:
-    """All x, then all y."""
-    return torch.cat([pairs[..., 0], pairs[..., 1]], 1)
+    depth = moved[..., 2:]
+    position = moved[..., :2] / depth
+    scale = focal[:, None, None]
+    # d (Y_x / Y_z, Y_y / Y_z) / d Y = (1, 0, -x; 0, 1, -y) / Y_z
+    plane, axis = moved.new_tensor(((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))), moved.new_tensor((0.0, 0.0, 1.0))
+    by_point = (plane - position[..., None] * axis) * (scale / depth)[..., None]
+    by_motion = torch.cat([by_point, -by_point @ cross_matrix(moved)], -1)
+    residual = (target - scale * position).flatten(1)
+    return Linearised(moved, by_point, residual, by_motion.flatten(1, 2), weights.flatten(1))
 
 
 def _normal_equations(

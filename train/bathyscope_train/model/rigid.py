@@ -8,15 +8,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+_CROSS = (
+    (0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0),
+    (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0, 0.0, 0.0),
+    (0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+)
+"""Cross matrix of each unit vector, row by row."""
+
 _EPSILON = 1e-7  # ONNX graph optimisers take an addition of 1e-8 for one of nothing and drop it
 
 
 def cross_matrix(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Matrix that takes the cross product with ``vector`` from the left."""
-    x, y, z = vector.unbind(-1)
-    zero = torch.zeros_like(x)
-    rows = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1)
-    return rows.reshape(*rows.shape[:-1], 3, 3)
+    # One product with a constant: taken apart and stacked, it would be a score of graph nodes, and it is everywhere.
+    matrix: Tensor = (vector @ vector.new_tensor(_CROSS)).unflatten(-1, (3, 3))
+    return matrix
 
 
 def rotation_exponential(angles: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
@@ -41,19 +47,12 @@ def rotation_logarithm(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3
 
 def antisymmetric_part(rotation: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     """The vector of the antisymmetric half of a matrix: axis times sine of the angle for a rotation."""
-    return 0.5 * torch.stack(
-        [
-            rotation[..., 2, 1] - rotation[..., 1, 2],
-            rotation[..., 0, 2] - rotation[..., 2, 0],
-            rotation[..., 1, 0] - rotation[..., 0, 1],
-        ],
-        -1,
-    )
+    return 0.5 * rotation.flatten(-2) @ rotation.new_tensor(_CROSS).transpose(0, 1)
 
 
 def trace(matrix: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     """Sum of the diagonal."""
-    return matrix[..., 0, 0] + matrix[..., 1, 1] + matrix[..., 2, 2]
+    return (matrix * torch.eye(3, dtype=matrix.dtype, device=matrix.device)).sum((-2, -1))
 
 
 def rotate(rotation: Float[Tensor, "*b 3 3"], vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:

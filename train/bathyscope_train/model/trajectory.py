@@ -74,14 +74,14 @@ def fuse_trajectory(motion: Motion, information: Float[Tensor, "b e 6 6"]) -> Mo
     inside = [(index >= gap).to(information.dtype)[:, None, None] for gap in GAPS]
     identity = torch.eye(6, dtype=information.dtype, device=information.device)
     trusted = [arriving[n][1] * inside[n] for n in range(len(GAPS))]
-    total = trusted[0] + trusted[1] + trusted[2] + _TINY_INFORMATION * identity
+    trusted[0] = trusted[0] + _TINY_INFORMATION * identity
+    shares = solve_columns(trusted[0] + trusted[1] + trusted[2], torch.cat(trusted, -1)).split(6, -1)
     for n, gap in enumerate(GAPS):
         pair = arriving[n][0]
         source = (index - gap).clamp_min(0)
         reached = compose((pair.rotation, pair.translation), (chain.rotation[:, source], chain.translation[:, source]))
         disagreement = difference(Motion(*reached), chain)
-        share = trusted[n] if gap > 1 else trusted[n] + _TINY_INFORMATION * identity
-        share = solve_columns(total, share) * inside[n]
+        share = shares[n] * inside[n]
         weights.append(share @ adjoint(pair.rotation, pair.translation))
         offsets.append(rotate(share, disagreement))
     correction = _affine_recurrence(weights, offsets[0] + offsets[1] + offsets[2])
