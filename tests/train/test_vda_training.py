@@ -101,9 +101,11 @@ def test_values_are_those_of_the_network() -> None:
 
 
 def test_metric_weights_give_depth_in_the_unit_of_the_poses() -> None:
-    module = VdaGeometry(network(), units_a_metre=1000.0)
-    depth = module(images(), known=sideways(4, None)).depth
-    torch.testing.assert_close(depth, 1000 * module.values(images()))
+    module = VdaGeometry(network(), metric=True, units_a_metre=100.0)
+    metres = module.values(images())
+    torch.testing.assert_close(module(images(), known=sideways(4, None)).depth, 100 * metres)
+    known = 7 * metres.detach() + 0.0
+    torch.testing.assert_close(module(images(), known=sideways(4, known)).depth, 7 * metres)
 
 
 def test_a_nominal_depth_stands_in_for_depth_that_is_not_there() -> None:

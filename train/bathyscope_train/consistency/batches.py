@@ -11,6 +11,7 @@ from torch import Tensor
 from bathyscope_train.consistency.clip_step import ClipStep
 from bathyscope_train.consistency.processes import Processes
 from bathyscope_train.consistency.settings import ConsistencySettings
+from bathyscope_train.consistency.video_step import VideoStep
 from bathyscope_train.data.clip_loader import FrameBatch
 from bathyscope_train.losses.balance import measured_weights
 
@@ -39,7 +40,7 @@ def mean_over(values: Mapping[str, Tensor], processes: Processes) -> dict[str, f
 
 @torch.no_grad()
 def balanced_weights(
-    step: ClipStep, batches: Iterable[FrameBatch], settings: ConsistencySettings, processes: Processes
+    step: ClipStep | VideoStep, batches: Iterable[FrameBatch], settings: ConsistencySettings, processes: Processes
 ) -> dict[str, float]:
     """Factors under which each term, at the size that it has before training, adds the share that its weight says.
 

@@ -22,12 +22,11 @@ from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from bathyscope.bundle import hash_file
 from bathyscope.errors import CheckpointError
 from bathyscope_train.model.checkpoints import save_checkpoint
-from bathyscope_train.model.network import Network
 
 FOLDER = "checkpoints"
 MODEL, AVERAGE, OPTIMIZER, POSITION = (
@@ -55,7 +54,7 @@ class Kept:
 def write_checkpoint(
     run: Path,
     step: int,
-    network: Network,
+    network: nn.Module,
     optimizer: Mapping[str, Tensor],
     *,
     average: Mapping[str, Tensor] | None = None,

@@ -18,7 +18,8 @@ from bathyscope_train.render import Renderer
 
 TOTAL, VARIATION, GROWTH = "total", "variation", "growth"
 TRUNK = "aggregator"
-_FLAT = 1e-6
+FLAT = 1e-6
+"""Variation of depth within a frame is not taken below this."""
 
 
 class ClipStep(nn.Module):
@@ -61,7 +62,7 @@ class ClipStep(nn.Module):
             rendered, geometry, before, images=images, inside=inside, settings=self.settings.loss, progress=progress
         )
         with torch.no_grad():
-            started = within_frame_variation(before.depth, inside).clamp_min(_FLAT)
+            started = within_frame_variation(before.depth, inside).clamp_min(FLAT)
             variation = within_frame_variation(rendered.depth, inside) / started
             growth = (geometry.depth / before.depth).log().mean()
         return {TOTAL: weighted_sum(terms, self.weights), **terms, VARIATION: variation, GROWTH: growth}

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import yaml
 
-from bathyscope.errors import DatasetError
+from bathyscope.errors import DatasetError, SettingsError
 from bathyscope.vision.grid import choose_size
 from bathyscope_train.consistency.clip_step import check_objective
 from bathyscope_train.consistency.memory import Memory, expected_memory
 from bathyscope_train.consistency.parts import Group, trained_groups
 from bathyscope_train.consistency.settings import ConsistencySettings
-from bathyscope_train.consistency.start import load_initial, open_videos_of
+from bathyscope_train.consistency.start import load_initial, open_videos_of, video_kind
 from bathyscope_train.data.datasets.sequence import DataSequence
 
 _NAMED = 5
@@ -76,6 +76,10 @@ def make_plan(settings: ConsistencySettings, *, processes: int = 1) -> Plan:
         CheckpointError: If the initial checkpoint cannot be used.
         DatasetError: If the data holds no video.
     """
+    if video_kind(settings.init, settings.preset) is not None:
+        raise SettingsError(
+            f"{settings.init}: --dry-run plans runs of our own network; try a video network with steps=1 warmup_steps=0"
+        )
     network = load_initial(settings.init, settings.preset)
     check_objective(network, settings)
     groups = trained_groups(network, settings.parts)

@@ -92,6 +92,14 @@ class ConsistencySettings(BaseModel, frozen=True, extra="forbid"):
         default="given",
         description="Of a head that solves for motion while it is frozen: taken as given, or differentiated through.",
     )
+    cameras_from: str | None = Field(
+        default=None,
+        description="For a network without cameras: a checkpoint of ours, EndoDAC's folder, or `data` for the poses "
+        "that come with the videos.",
+    )
+    nominal_depth: PositiveFloat | None = Field(
+        default=None, description="For such a network and `cameras_from=data`: median depth in the unit of the poses."
+    )
     known_focal: bool = Field(default=False, description="Tell the network the focal length where the data has it.")
 
     seed: NonNegativeInt = 0

@@ -15,6 +15,8 @@ from bathyscope_train.model.checkpoints import load_network, names_its_network
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import get_preset
 from bathyscope_train.model.weight_files import open_weights
+from bathyscope_train.systems.kinds import Kind
+from bathyscope_train.systems.recognition import kind_called, recognise
 
 SURVEY_FOLDER = "survey"
 _HEADS_THAT_MAY_BE_NEW = ("gaussian_param_head.",)
@@ -51,6 +53,27 @@ def load_initial(path: Path, preset: str | None) -> Network:
     if report.missing:
         _log.warning("%s: has no Gaussian head; it starts from noise (%s)", path, report)
     return network
+
+
+def video_kind(path: Path, preset: str | None) -> Kind | None:
+    """The kind of Video Depth Anything that a file holds; ``None`` for every other network.
+
+    Raises:
+        CheckpointError: If the file cannot be used, or does not hold the kind that is asked for.
+    """
+    wanted = kind_called(preset)
+    if preset is not None and wanted is None:
+        return None
+    kind = recognise(path, wanted) if wanted is not None else _recognised(path)
+    return kind if kind is not None and kind.name.startswith("vda-") else None
+
+
+def _recognised(path: Path) -> Kind | None:
+    """The kind of published weights; ``None`` for what is told in other ways, or not at all."""
+    try:
+        return recognise(path)
+    except CheckpointError:
+        return None
 
 
 def open_videos_of(settings: ConsistencySettings) -> OpenedSources:

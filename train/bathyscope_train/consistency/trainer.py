@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
 from bathyscope.errors import SettingsError
-from bathyscope_train.consistency.batches import Part, balanced_weights, mean_over, parts_of
+from bathyscope_train.consistency.batches import balanced_weights, mean_over, parts_of
 from bathyscope_train.consistency.checkpoint_folder import Kept, read_last_checkpoint, write_checkpoint
 from bathyscope_train.consistency.clip_step import TOTAL, ClipStep
 from bathyscope_train.consistency.optimizer_state import optimizer_tensors, restore_optimizer
@@ -20,7 +22,8 @@ from bathyscope_train.consistency.processes import Processes, joined
 from bathyscope_train.consistency.records import check_same_run, training_record, write_settings
 from bathyscope_train.consistency.reports import Reports
 from bathyscope_train.consistency.settings import ConsistencySettings
-from bathyscope_train.consistency.start import load_initial, open_training_windows
+from bathyscope_train.consistency.start import load_initial, open_training_windows, video_kind
+from bathyscope_train.consistency.video_step import VideoStep
 from bathyscope_train.consistency.watch import Watch
 from bathyscope_train.data.clip_loader import FrameBatch, WindowLoader
 from bathyscope_train.data.clip_sources import sources_hash
@@ -52,11 +55,20 @@ def optimise(settings: ConsistencySettings) -> Path:
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     with joined(settings.device) as processes:
-        run = ConsistencyRun(settings, processes)
+        run = run_of(settings)(settings, processes)
         try:
             return run.train()
         finally:
             run.close()
+
+
+def run_of(settings: ConsistencySettings) -> type[ConsistencyRun]:
+    """How the network that ``settings.init`` holds is trained."""
+    if video_kind(settings.init, settings.preset) is None:
+        return ConsistencyRun
+    from bathyscope_train.consistency.video_run import VideoRun
+
+    return VideoRun
 
 
 class ConsistencyRun:
@@ -66,11 +78,10 @@ class ConsistencyRun:
         self.settings, self.processes = settings, processes
         _check_shares(settings, processes.world_size)
         torch.manual_seed(settings.seed)
-        self.network = load_initial(settings.init, settings.preset).to(processes.device)
+        self.network = self._initial().to(processes.device)
         check_same_run(settings)
         self.autocast = use_bfloat16(settings.precision, processes.device)
-        renderer = splatting(processes.device)
-        self.step_module = ClipStep(self.network, settings, renderer, autocast=self.autocast)
+        self.step_module = self._objective()
         self.groups = trained_groups(self.network, settings.parts)
         self.optimizer = torch.optim.AdamW(
             optimizer_groups(self.network, self.groups, settings), betas=settings.betas, lr=settings.peak_lr
@@ -89,6 +100,19 @@ class ConsistencyRun:
         self.reports = Reports(settings, start=self.step, recent=told) if processes.first else None
         self.active: frozenset[str] = frozenset()
         self.shared: nn.Module = self.step_module
+
+    def _initial(self) -> nn.Module:
+        """The network that training starts from."""
+        return load_initial(self.settings.init, self.settings.preset)
+
+    def _objective(self) -> ClipStep | VideoStep:
+        """What is called in every step."""
+        renderer = splatting(self.processes.device)
+        return ClipStep(cast(Network, self.network), self.settings, renderer, autocast=self.autocast)
+
+    def _parts(self, batch: FrameBatch) -> Sequence[tuple[Any, ...]]:
+        """What it is called with: the batch on the device, in parts."""
+        return parts_of(batch, self.settings, self.processes.device)
 
     def train(self) -> Path:
         """Take the steps that are left; returns the path of the weights."""
@@ -122,7 +146,7 @@ class ConsistencyRun:
         self._share()
         batch = next(self.loader)
         self.optimizer.zero_grad(set_to_none=True)
-        parts = parts_of(batch, settings, self.processes.device)
+        parts = self._parts(batch)
         values: dict[str, Tensor] = {}
         for number, part in enumerate(parts):
             found = self._forward_backward(part, last=number == len(parts) - 1)
@@ -143,16 +167,15 @@ class ConsistencyRun:
         self.step += 1
         return {**numbers, "gradient_norm": float(norm), "rate": rate}, batch
 
-    def _forward_backward(self, part: Part, *, last: bool) -> dict[str, Tensor]:
+    def _forward_backward(self, part: tuple[Any, ...], *, last: bool) -> dict[str, Tensor]:
         """One part of a batch forward and back; gradients are exchanged with the last."""
-        images, inside, focal = part
         shared, count = self.shared, self.settings.accumulate
         if isinstance(shared, DistributedDataParallel) and not last:
             with shared.no_sync():
-                found: dict[str, Tensor] = shared(images, inside, focal, self.progress)
+                found: dict[str, Tensor] = shared(*part, self.progress)
                 (found[TOTAL] / count).backward()
             return found
-        found = shared(images, inside, focal, self.progress)
+        found = shared(*part, self.progress)
         (found[TOTAL] / count).backward()
         return found
 
@@ -251,21 +274,21 @@ class ConsistencyRun:
             return
         self.reports.tell(self.step, values)
         if self.step % self.settings.pictures_every == 0 or self.step == 1:
-            images, inside, focal = parts_of(batch, self.settings, self.processes.device)[0]
-            self.reports.picture(self.step, picture_grid(images[0], self.step_module.look(images, inside, focal)))
+            part = self._parts(batch)[0]
+            self.reports.picture(self.step, picture_grid(part[0][0], self.step_module.look(*part)))
 
     def _validate(self) -> None:
         if self.reports is not None and self.settings.validate_every:
-            self.reports.validate(self.step, self._result())
+            self.reports.validate(self.step, cast(Network, self._result()))
 
-    def _result(self) -> Network:
+    def _result(self) -> nn.Module:
         """A copy of the network on the CPU, with the running average of the weights where there is one."""
-        network = Network(self.network.preset)
+        network = Network(cast(Network, self.network).preset)
         network.load_state_dict(self.average or self.network.state_dict())
         return network.eval()
 
 
-def _copy_of(network: Network) -> dict[str, Tensor]:
+def _copy_of(network: nn.Module) -> dict[str, Tensor]:
     return {name: value.detach().clone() for name, value in network.state_dict().items()}
 
 

@@ -34,12 +34,14 @@ class VdaGeometry(nn.Module):
     *Relative* weights give disparity up to a scale and a shift. In every step both are fitted, without gradient, to
     the depth that comes with the cameras (medians and mean absolute deviations of inverse depth, clip by clip): the
     network can change the shape of its depth, but gains nothing by growing or shrinking it against the poses. Without
-    such depth ``nominal_depth`` stands in for its median. *Metric* weights give metres, and nothing is fitted.
+    such depth ``nominal_depth`` stands in for its median. *Metric* weights give metres: of them only the unit is
+    fitted, clip by clip, to the median of that depth; without it ``units_a_metre`` says what the unit is.
 
     Args:
         network: In training; its encoder works without gradients unless one of its parameters has some.
         cameras: Where cameras come from; None if every call brings them.
-        units_a_metre: For metric weights, how many units of the poses one metre has; None for relative ones.
+        metric: Whether the weights are metric ones.
+        units_a_metre: How many units of the poses one metre has.
         nominal_depth: Median depth, in the unit of the poses, of clips that come without depth.
         recompute: Work out the fine half of the head again going back: less memory for more time.
     """
@@ -49,14 +51,16 @@ class VdaGeometry(nn.Module):
         network: VideoDepthAnything,
         cameras: CameraSource | None = None,
         *,
-        units_a_metre: float | None = None,
+        metric: bool = False,
+        units_a_metre: float = 1000.0,
         nominal_depth: float | None = None,
         recompute: bool = True,
     ) -> None:
         super().__init__()
         self.network = network
         self.cameras = cameras
-        self.units_a_metre, self.nominal_depth, self.recompute = units_a_metre, nominal_depth, recompute
+        self.metric, self.units_a_metre = metric, units_a_metre
+        self.nominal_depth, self.recompute = nominal_depth, recompute
 
     def forward(
         self,
@@ -75,14 +79,12 @@ class VdaGeometry(nn.Module):
             GeometryError: If there are neither cameras nor a source of them, or a clip of relative values comes without
                 depth and without a nominal one.
         """
-        if known is None and self.cameras is None:
-            raise GeometryError("a clip came without cameras, and there is no system to take them from")
-        cameras = known if known is not None else self.cameras(images)  # type: ignore[misc]
+        cameras = known if known is not None else self.borrowed(images)
         values = self.values(images)
-        if self.units_a_metre is not None:
-            depth = values * self.units_a_metre
+        where = images.new_ones(values[:, 0].shape, dtype=torch.bool) if inside is None else inside
+        if self.metric:
+            depth = values * self._units(values.detach(), cameras.depth, where)
         else:
-            where = images.new_ones(values[:, 0].shape, dtype=torch.bool) if inside is None else inside
             scale, shift, median = self._fit(values.detach(), cameras.depth, where)
             depth = 1 / softly_positive(scale * values + shift, median)
         return ClipGeometry(depth, cameras.world_from_camera, cameras.intrinsics, None)
@@ -105,9 +107,35 @@ class VdaGeometry(nn.Module):
         stacked: Tensor = torch.cat(finished).unflatten(0, (b, t))
         return stacked
 
+    def borrowed(self, images: Float[Tensor, "b t 3 h w"]) -> ClipCameras:
+        """The source's cameras of these clips.
+
+        Raises:
+            GeometryError: If there is no source.
+        """
+        if self.cameras is None:
+            raise GeometryError("a clip came without cameras, and there is no system to take them from")
+        return self.cameras(images)
+
     def frozen_copy(self) -> Self:
-        """The network as it is now, never trained: whose valid pixels the losses may be held to."""
-        return copy.deepcopy(self).requires_grad_(False).eval()
+        """The network as it is now, never trained: whose valid pixels the losses may be held to.
+
+        The source of cameras is shared, not copied.
+        """
+        memo = {} if self.cameras is None else {id(self.cameras): self.cameras}
+        return copy.deepcopy(self, memo).requires_grad_(False).eval()
+
+    @torch.no_grad()
+    def _units(self, values: Tensor, depth: Tensor | None, inside: Tensor) -> Tensor | float:
+        """Units of the poses in a metre, (b, 1, 1, 1) where depth tells them clip by clip."""
+        if depth is None:
+            return self.units_a_metre
+        ratios = []
+        for clip, each in enumerate(values):
+            counted = inside[clip].expand_as(each) & (depth[clip] > 0)
+            wanted, found = (centre_and_spread(maps[counted])[0] for maps in (depth[clip], each))
+            ratios.append(wanted / found.clamp_min(1e-6))
+        return torch.stack(ratios)[:, None, None, None]
 
     @torch.no_grad()
     def _fit(self, values: Tensor, depth: Tensor | None, inside: Tensor) -> tuple[Tensor, Tensor, Tensor]:
