@@ -134,8 +134,8 @@ def session_options(threads: int | None, *, reuse: bool = True) -> ort.SessionOp
 
     Args:
         threads: Threads of an operator; all cores unless given.
-        reuse: Plan which results may share memory. For the thousands of small results of a camera solver that plan takes
-            seconds (it grows with the square of their number) and saves 27 MB.
+        reuse: Plan which results may share memory. For the thousands of small results of a camera solver that plan
+            takes seconds (it grows with the square of their number) and saves 27 MB.
     """
     options = ort.SessionOptions()
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
