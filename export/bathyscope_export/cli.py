@@ -14,6 +14,7 @@ from bathyscope.model_spec import InputSpec
 if TYPE_CHECKING:
     from bathyscope_train.model.network import Network
     from bathyscope_train.systems.kinds import Kind
+    from bathyscope_train.systems.video_networks import VideoNetwork
 
 app = typer.Typer(add_completion=False)
 _WRONG_USAGE = 2
@@ -22,7 +23,9 @@ _PIXELS, _WINDOW, _OVERLAP = 112 * 140, 8, 2
 
 @app.command()
 def export(  # noqa: PLR0917 - typer: one parameter an option
-    checkpoint: Annotated[Path, typer.Argument(help="Weights: safetensors or a PyTorch file.")],
+    checkpoint: Annotated[
+        Path, typer.Argument(help="Weights: safetensors, a PyTorch file, EndoDAC's folder; or constant, brightness.")
+    ],
     bundle: Annotated[Path, typer.Argument(help="Folder that the bundle becomes.")],
     preset: Annotated[
         str | None, typer.Option(help="Network of weights that do not tell it by their keys: vda-s-metric, anysplat.")
@@ -61,15 +64,13 @@ def export(  # noqa: PLR0917 - typer: one parameter an option
     record = {} if accuracy is None else _read_accuracy(accuracy)
     called = name or bundle.name
     try:
-        kind = _kind(checkpoint, preset)
-        if kind is not None and kind.video is not None:
+        video, kind = _video(checkpoint, preset)
+        if video is not None:
             given = {"--pixels": pixels, "--window": window, "--overlap": overlap, "--licence": licence}
-            _refuse(kind.name, {**given, "--research-only": research_only, "--half-weights": half_weights})
-            digest = hash_file(_file(checkpoint, kind)).sha256
-            video = VideoBundleSettings(called, version, weights_sha256=digest, accuracy=record)
-            written = write_video_bundle(
-                kind.video(checkpoint, kind.name), bundle, video, replace=replace, progress=_say
-            )
+            _refuse(video.name, {**given, "--research-only": research_only, "--half-weights": half_weights})
+            digest = None if kind is None else hash_file(_file(checkpoint, kind)).sha256
+            about = VideoBundleSettings(called, version, weights_sha256=digest, accuracy=record)
+            written = write_video_bundle(video, bundle, about, replace=replace, progress=_say)
         else:
             network = _network(checkpoint, preset if kind is None else kind.preset)
             settings = BundleSettings(
@@ -87,6 +88,16 @@ def export(  # noqa: PLR0917 - typer: one parameter an option
         typer.echo(f"bathyscope export: {error}", err=True)
         raise typer.Exit(_WRONG_USAGE) from error
     typer.echo(written.folder)
+
+
+def _video(checkpoint: Path, preset: str | None) -> "tuple[VideoNetwork | None, Kind | None]":
+    """The video network that the weights, or the name of a guess, stand for; and of what kind the weights are."""
+    from bathyscope_train.systems.guess_networks import GUESSES, guess_network
+
+    if str(checkpoint) in GUESSES and not checkpoint.exists():
+        return guess_network(str(checkpoint)), None
+    kind = _kind(checkpoint, preset)
+    return (None if kind is None or kind.video is None else kind.video(checkpoint, kind.name)), kind
 
 
 def _kind(checkpoint: Path, preset: str | None) -> "Kind | None":

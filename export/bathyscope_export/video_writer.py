@@ -29,8 +29,8 @@ class VideoBundleSettings:
 
     name: str
     version: str
-    weights_sha256: str
-    """Of the checkpoint that it was made from."""
+    weights_sha256: str | None
+    """Of the checkpoint that it was made from; None for a guess, which has none."""
     accuracy: Mapping[str, Any]
     """Measured accuracy, with protocol."""
 
@@ -157,7 +157,7 @@ def _write_card(
         "No cameras, no confidence, no scene. Not a medical device.",
         "",
         f"* Licence of the weights: {video.licence}" + ("; for research only" if video.research_only else ""),
-        f"* SHA-256 of the checkpoint: {settings.weights_sha256}",
+        f"* SHA-256 of the checkpoint: {settings.weights_sha256 or 'there is none'}",
         f"* Largest difference from PyTorch: {max(record['values'] for record in parity):.1e} of the values' "
         "standard deviation",
         "",

@@ -24,6 +24,7 @@ from bathyscope.vision.shorter_side import to_network
 from bathyscope_export.attention import fused_count
 from bathyscope_export.cli import app
 from bathyscope_export.video_writer import ValueDifference, VideoBundleSettings, compare_video, write_video_bundle
+from bathyscope_train.systems.baselines import BASELINES
 from bathyscope_train.systems.endodac import DepthNetwork, DepthSettings
 from bathyscope_train.systems.vda.network import VideoDepthAnything
 from bathyscope_train.systems.vda.settings import SIZES, VdaSettings
@@ -178,3 +179,15 @@ def test_the_command_tells_a_video_network_by_its_keys_and_refuses_what_it_decid
     wrong = CliRunner().invoke(app, [*arguments, "--preset", "endodav"])
     assert (wrong.exit_code, "its tensors are those of vda-s" in wrong.stderr) == (2, True)
     assert not (tmp_path / "bundle").exists()
+
+
+@pytest.mark.parametrize("name", ["constant", "brightness"])
+def test_a_guess_becomes_a_bundle_by_its_name(tmp_path: Path, name: str) -> None:
+    done = CliRunner().invoke(app, [name, str(tmp_path / "bundle")])
+    assert done.exit_code == 0, done.stderr
+    bundle = Bundle.open(tmp_path / "bundle")
+    assert bundle.manifest.training == {"weights_sha256": None}
+    pictures = np.random.default_rng(0).integers(0, 255, (2, 518, 518, 3)).astype(np.uint8)  # seen as they are
+    frames = Clip(pictures, np.arange(2) / 25.0)
+    for frame, image in zip(engine_factory()(bundle).run(frames), frames.frames, strict=True):
+        np.testing.assert_allclose(frame.depth, BASELINES[name].guess(image), rtol=1e-4)

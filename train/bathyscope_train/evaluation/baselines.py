@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-_LUMA = np.array([0.299, 0.587, 0.114])
+LUMA = np.array([0.299, 0.587, 0.114])
 """Weights of R, G, B in brightness (ITU-R BT.601)."""
-_DARKEST = 1.0 / 255.0
+DARKEST = 1.0 / 255.0
 """Brightness is not taken below one grey level, where 1 / sqrt would run away."""
 
 
@@ -28,5 +28,5 @@ def brightness_depth(frame: NDArray[np.uint8]) -> NDArray[np.float64]:
     Args:
         frame: RGB (h, w, 3).
     """
-    brightness = frame.astype(np.float64) @ _LUMA / 255.0
-    return np.asarray(1.0 / np.sqrt(np.maximum(brightness, _DARKEST)), np.float64)
+    brightness = frame.astype(np.float64) @ LUMA / 255.0
+    return np.asarray(1.0 / np.sqrt(np.maximum(brightness, DARKEST)), np.float64)
