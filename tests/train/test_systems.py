@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from made_bundle import write_video_bundle
 from safetensors.torch import save_file
 from torch import nn
 
@@ -118,6 +119,25 @@ def test_a_bundle_runs_on_the_installed_engine(clip: Clip) -> None:
     accumulated = next(iter(zipped.estimate(clip)))
     expected = next(iter(system.estimate(clip)))
     assert (accumulated.values <= expected.values + 1e-5).mean() > 0.9  # not divided by opacity
+
+
+@pytest.mark.parametrize(
+    ("scale", "unit", "expected", "factor"), [("affine", None, "disparity", 1.0), ("metric", "m", "depth", 1000.0)]
+)
+def test_a_bundle_of_a_video_network_says_what_its_values_are(
+    tmp_path: Path, clip: Clip, *, scale: str, unit: str | None, expected: str, factor: float
+) -> None:
+    windows = {"length": 4, "key_places": [0, 2, 3], "blend": 2, "fit": "none" if unit else "references"}
+    video = {"quantity": expected, "scale": scale, "unit": unit, "resize": {"least": [28, 28]}, "windows": windows}
+    write_video_bundle(tmp_path / "bundle", video, 4, 3)
+    system = opened(str(tmp_path / "bundle"))
+    info = system.info
+    assert (info.quantity, info.scale, info.unit) == (expected, scale, "mm" if unit else None)
+    assert (info.cameras, info.confidence, info.gaussians) == (False, False, False)
+    estimates = list(system.estimate(clip, np.eye(3)))
+    means = [estimate.values.mean() for estimate in estimates]
+    np.testing.assert_allclose(means, factor * clip.frames.mean((1, 2, 3)) / 255, rtol=0.05)
+    assert {estimate.world_from_camera is None for estimate in estimates} == {True}
 
 
 @pytest.mark.slow  # compiles the splatter
