@@ -38,7 +38,7 @@ train-gpu-slice:
 	for domain in source shifted broad; do \
 		$(TRAINER) -m bathyscope_train.data.synthetic clips/$${domain}_val --domain $$domain $(HELD_OUT) > /dev/null \
 		|| exit 1; done
-	$(TRAINER) -m bathyscope_train.cli configs/pretrain_gpu.yaml out=$(RUN) $(TRAIN)
+	$(TRAINER) -m bathyscope_train configs/pretrain_gpu.yaml out=$(RUN) $(TRAIN)
 	$(if $(OUT),$(TRAINER) -m bathyscope_train.weight_parts split $(RUN)/model.safetensors $(OUT))
 	$(if $(OUT),cp $(RUN)/metrics.jsonl $(RUN)/validation.png $(RUN)/curves.png $(OUT)/)
 

@@ -35,6 +35,7 @@ class RenderSettings(BaseModel, frozen=True, extra="forbid"):
     pool: PositiveInt = Field(default=64, description="Clips from which windows are drawn.")
     fresh: PositiveInt = Field(default=2, description="Clips that are replaced by new ones at every step.")
     takes: PositiveInt = Field(default=4, description="Clips of one scene, each with its own camera, light and sensor.")
+    compiled: bool = Field(default=False, description="Trace and shade by compiled code; takes a minute to start.")
     processes: NonNegativeInt = Field(default=1, description="Processes that draw scenes; 0 draws them in between.")
 
     @model_validator(mode="after")

@@ -36,17 +36,17 @@ def split_weights(path: Path, folder: Path, *, limit_mb: float = 15.0) -> list[P
         size = tensor.nbytes + 512  # the header's line
         if size > limit_mb * 1e6:
             raise CheckpointError(f"{path}: {name} has {tensor.nbytes / 1e6:.1f} MB, a part holds {limit_mb} MB")
-        place = next((k for k, left in enumerate(room) if left >= size), len(parts))
-        if place == len(parts):
+        fits = next((k for k, left in enumerate(room) if left >= size), len(parts))
+        if fits == len(parts):
             parts.append({})
             room.append(limit_mb * 1e6 - sum(len(key) + len(text) for key, text in metadata.items()) - 1024)
-        parts[place][name] = tensor
-        room[place] -= size
+        parts[fits][name] = tensor
+        room[fits] -= size
     folder.mkdir(parents=True, exist_ok=True)
-    names = [folder / f"{path.stem}-{k}-of-{len(parts)}.safetensors" for k in range(1, len(parts) + 1)]
-    for name, part in zip(names, parts, strict=True):
-        save_file(part, name, metadata=metadata)
-    return names
+    written = [folder / f"{path.stem}-{k}-of-{len(parts)}.safetensors" for k in range(1, len(parts) + 1)]
+    for place, part in zip(written, parts, strict=True):
+        save_file(part, place, metadata=metadata)
+    return written
 
 
 def join_weights(folder: Path, path: Path) -> Path:

@@ -77,7 +77,9 @@ class RenderedPool:
         self.stream.close()
 
     def _render(self, count: int) -> ClipBatch:
-        return render_plans(self.stream.take(count), device=self.device, generator=self.generator)
+        return render_plans(
+            self.stream.take(count), device=self.device, generator=self.generator, compiled=self.settings.compiled
+        )
 
     def _cut(self, clips: Int[Tensor, "b 1"], index: Int[Tensor, "b t"]) -> Batch:
         poses = self.clips["world_from_camera"][clips, index].double()

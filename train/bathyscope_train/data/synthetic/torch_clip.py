@@ -73,6 +73,7 @@ def render_plans(
     device: torch.device | str = "cpu",
     dtype: torch.dtype = torch.float32,
     generator: torch.Generator | None = None,
+    compiled: bool = False,
 ) -> ClipBatch:
     """Render clips that are planned; see :func:`render_clips`.
 
@@ -81,6 +82,7 @@ def render_plans(
         device: Where to render.
         dtype: float32, or float64 to look for differences.
         generator: Source of the noise, on ``device``.
+        compiled: Trace and shade by compiled code; pays where very many clips are rendered.
 
     Raises:
         SettingsError: If a plan has what this renderer has not.
@@ -88,7 +90,9 @@ def render_plans(
     check_plans(plans)
     kinds = [(plan.scene.surface.kind, _has_solids(plan)) for plan in plans]
     groups = [[index for index, kind in enumerate(kinds) if kind == wanted] for wanted in sorted(set(kinds))]
-    parts = [_render([plans[index] for index in group], device, dtype, generator) for group in groups]
+    parts = [
+        _render([plans[index] for index in group], device, dtype, generator, compiled=compiled) for group in groups
+    ]
     order = torch.tensor(np.argsort(np.concatenate(groups)), device=parts[0].frames.device)
     return ClipBatch(
         frames=torch.cat([part.frames for part in parts])[order],
@@ -107,10 +111,15 @@ def _has_solids(plan: ClipPlan) -> bool:
 
 
 def _render(
-    plans: Sequence[ClipPlan], device: torch.device | str, dtype: torch.dtype, generator: torch.Generator | None
+    plans: Sequence[ClipPlan],
+    device: torch.device | str,
+    dtype: torch.dtype,
+    generator: torch.Generator | None,
+    *,
+    compiled: bool,
 ) -> ClipBatch:
     """Clips whose scenes have one kind of surface, and all solids or none."""
-    pictures = render_scenes(scene_tensors(plans, device, dtype), plans[0].size)
+    pictures = render_scenes(scene_tensors(plans, device, dtype, compiled=compiled), plans[0].size)
     radiance, depth, mover = (values.unflatten(0, (len(plans), -1)) for values in pictures)
     sensors = [plan.sensor for plan in plans]
     poses, intrinsics, distortion = (

@@ -8,13 +8,19 @@ Moving is the only place where the host waits for the device.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import cache
 from typing import Any, TypeVar, cast
 
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 Part = TypeVar("Part")
+Result = TypeVar("Result")
 State = tuple[Tensor, ...]
+
+_BACKEND = "inductor"
+_VARIANTS = 32  # kinds of surface, with and without films, swelling, a second light ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +83,20 @@ def spread(part: Part, chosen: Chosen) -> Part:
         values = {name: spread(getattr(part, name), chosen) for name in names}
         return cast(Part, replace(cast(Any, part), **values))
     return part
+
+
+def everything(rows: int, rays: int, device: torch.device) -> Chosen:
+    """All rays of all rows."""
+    index = torch.arange(rows * rays, device=device)
+    return Chosen(index, index // rays)
+
+
+@cache
+def compiled(function: Callable[..., Result]) -> Callable[..., Result]:
+    """The function as ``torch.compile`` makes it on its first call, for rays of any number."""
+    config = torch._dynamo.config
+    config.recompile_limit = max(config.recompile_limit, _VARIANTS)
+    return cast(Callable[..., Result], torch.compile(function, dynamic=True, backend=_BACKEND))
 
 
 def repeat_in_rounds(

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bathyscope_train.data.synthetic.kernels import NEAREST_MM, ON_SURFACE_MM
 from bathyscope_train.data.synthetic.solid_tracing import NEVER
-from bathyscope_train.data.synthetic.torch_layout import marked, pick, put, spread
+from bathyscope_train.data.synthetic.torch_layout import compiled, everything, marked, pick, put, spread
 from bathyscope_train.data.synthetic.torch_lens import undistort
 from bathyscope_train.data.synthetic.torch_scene import CameraTensors, SceneTensors
 from bathyscope_train.data.synthetic.torch_shading import View, shade
@@ -62,9 +62,12 @@ def render_scenes(scene: SceneTensors, size: tuple[int, int]) -> Pictures:
         size: Height and width.
     """
     rays = _pixel_rays(scene.camera.position, size)
+    if scene.surface is not None and scene.surface.compiled:  # a row of all rays: compiled for one layout only
+        every = everything(rays.u.shape[0], rays.u.shape[1], rays.u.device)
+        scene, rays = spread(scene, every), Rays(*spread(tuple(rays), every))
     hits = cast_rays(scene, rays)
-    maps = hits.depth.unflatten(1, size)
-    bend = (_bend(maps, 2) + _bend(maps, 1)).flatten(1)
+    maps = hits.depth.view(-1, *size)
+    bend = (_bend(maps, 2) + _bend(maps, 1)).view_as(hits.depth)
     rough = (hits.highlight > _BRIGHT) | (bend > 0.03 * hits.depth)
     mover = torch.zeros_like(hits.solid)
     if scene.solids is not None:
@@ -73,7 +76,7 @@ def render_scenes(scene: SceneTensors, size: tuple[int, int]) -> Pictures:
         mover = torch.where(hits.solid >= 0, scene.solids.every.at(number, torch.zeros_like(number))[..., 1].long(), 0)
     rays = rays._replace(start=(0.85 * (hits.depth - bend)).clamp_min(NEAREST_MM))
     radiance = _supersampled(scene, hits.radiance, rough, rays)
-    return Pictures(radiance.unflatten(2, size).transpose(0, 1), maps, mover.unflatten(1, size))
+    return Pictures(radiance.reshape(3, -1, *size).transpose(0, 1), maps, mover.view(-1, *size))
 
 
 def _pixel_rays(like: Float[Tensor, "3 s 1"], size: tuple[int, int]) -> Rays:
@@ -93,8 +96,7 @@ def _bend(depth: Float[Tensor, "s h w"], axis: int) -> Float[Tensor, "s h w"]:
 
 def _edges(hits: Hits, size: tuple[int, int]) -> Bool[Tensor, "s n"]:
     """Where one solid ends, and on solids the edges of a pattern or a shadow."""
-    solid = hits.solid.unflatten(1, size)
-    plain = hits.radiance.sum(0).unflatten(1, size)
+    solid, plain = hits.solid.view(-1, *size), hits.radiance.sum(0).view(-1, *size)
     other, jump = torch.zeros_like(solid, dtype=torch.bool), torch.zeros_like(plain)
     for axis in (1, 2):
         count = solid.shape[axis]
@@ -102,7 +104,7 @@ def _edges(hits: Hits, size: tuple[int, int]) -> Bool[Tensor, "s n"]:
             beside = (torch.arange(count, device=solid.device) + shift).clamp(0, count - 1)
             other |= solid.index_select(axis, beside) != solid
             jump += (plain.index_select(axis, beside) - plain).abs()
-    edges: Bool[Tensor, "s n"] = (other | ((solid >= 0) & (jump > 0.25 * plain))).flatten(1)
+    edges: Bool[Tensor, "s n"] = (other | ((solid >= 0) & (jump > 0.25 * plain))).view_as(hits.solid)
     return edges
 
 
@@ -166,6 +168,7 @@ def _meet_tissue(scene: SceneTensors, start: Values, direction: Points) -> tuple
         return Hits(nothing, torch.zeros_like(direction), nothing, none), torch.full_like(start, NEVER)
     distance = trace(scene.surface, start, scene.camera.position, direction)
     view = _view(scene.camera, direction, distance)
-    radiance, highlight = shade(scene.surface, scene.tissue, scene.lamp, scene.camera, view)
+    light = compiled(shade) if scene.surface.compiled else shade
+    radiance, highlight = light(scene.surface, scene.tissue, scene.lamp, scene.camera, view)
     there = free_depth(scene.surface, view.points).abs() < ON_SURFACE_MM
     return Hits(torch.where(there, distance, 0.0), radiance, highlight, none), distance

@@ -42,6 +42,8 @@ class SurfaceTensors:
     stride_mm: Float[Tensor, "s 1"]
     leap_mm: Float[Tensor, "s 1"]
     feature_mm: Float[Tensor, "s 1"]
+    compiled: bool
+    """Whether rays are traced and shaded by compiled code."""
     waves: Float[Tensor, "4 w s 1"] | None
     """By what the heights of each row differ from those at rest, filled up with waves of nothing; None: all rest."""
 
@@ -124,7 +126,11 @@ class SceneTensors:
 
 
 def scene_tensors(
-    plans: Sequence[ClipPlan], device: torch.device | str, dtype: torch.dtype = torch.float32
+    plans: Sequence[ClipPlan],
+    device: torch.device | str,
+    dtype: torch.dtype = torch.float32,
+    *,
+    compiled: bool = False,
 ) -> SceneTensors:
     """Put the scenes of ``plans`` on a device, s = plans * frames. A scene that several plans share is there once.
 
@@ -132,12 +138,13 @@ def scene_tensors(
         plans: Clips of one length, size and kind of surface.
         device: Where to.
         dtype: float32, or float64 to look for differences.
+        compiled: Trace and shade by code that ``torch.compile`` makes when it is first needed; the same to rounding.
     """
     builder = _Builder(plans, device, dtype)
     soft = plans[0].scene.surface.kind != NOTHING
     rows = [solids_of(plan, frame) for plan in plans for frame in range(builder.frames)]
     return SceneTensors(
-        surface=_surface(builder) if soft else None,
+        surface=_surface(builder, compiled=compiled) if soft else None,
         tissue=_tissue(builder) if soft else None,
         solids=solid_tensors(rows, device, dtype) if any(len(solids.kind) for solids in rows) else None,
         lamp=_lamp(builder),
@@ -208,7 +215,7 @@ class _Builder:
         return self.of_plans([pick(tissue) for tissue in self.tissues])
 
 
-def _surface(builder: _Builder) -> SurfaceTensors:
+def _surface(builder: _Builder, *, compiled: bool) -> SurfaceTensors:
     surfaces = builder.surfaces
     kind = surfaces[0].kind
     assert all(surface.kind == kind for surface in surfaces), "a batch has one kind of surface"
@@ -237,6 +244,7 @@ def _surface(builder: _Builder) -> SurfaceTensors:
         stride_mm=builder.of_surface(lambda s: s.stride_mm),
         leap_mm=builder.of_surface(lambda s: s.leap_mm),
         feature_mm=builder.of_surface(lambda s: s.feature_mm),
+        compiled=compiled,
         waves=_waves(builder),
     )
 

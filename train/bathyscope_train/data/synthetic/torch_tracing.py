@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bathyscope_train.data.synthetic.scene import BLOCK, TUBE
-from bathyscope_train.data.synthetic.torch_layout import State, repeat_in_rounds
+from bathyscope_train.data.synthetic.torch_layout import State, compiled, repeat_in_rounds
 from bathyscope_train.data.synthetic.torch_scene import SurfaceTensors
 from bathyscope_train.data.synthetic.tracing import CLOSE_MM, FARTHEST_MM, REFINEMENTS
 
@@ -77,12 +77,13 @@ def _free(surface: SurfaceTensors, row: Values, column: Values, reach: Values) -
 
 def trace(surface: SurfaceTensors, start: Values, origin: Points, direction: Points) -> Values:
     """Distance along unit rays to the surface, looked for from ``start``."""
+    march, refine = (compiled(_march), compiled(_refine)) if surface.compiled else (_march, _refine)
     fixed = (origin, direction)
     free = free_depth(surface, origin + start * direction)
     before = surface.stride_mm.expand_as(start)
     state: State = (torch.zeros_like(start), start, before, free, torch.zeros_like(start))
-    near, far, before, free, _ = repeat_in_rounds(_march, _in_the_open, surface, fixed, state, rounds=_MARCH)
-    near, far, _, _ = repeat_in_rounds(_refine, _apart, surface, fixed, (near, far, before, free), rounds=_REFINE)
+    near, far, before, free, _ = repeat_in_rounds(march, _in_the_open, surface, fixed, state, rounds=_MARCH)
+    near, far, _, _ = repeat_in_rounds(refine, _apart, surface, fixed, (near, far, before, free), rounds=_REFINE)
     return 0.5 * (near + far)
 
 
