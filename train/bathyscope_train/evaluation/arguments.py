@@ -1,10 +1,11 @@
-"""Arguments of ``bathyscope evaluate``, arranged so that one command serves three ways of asking.
+"""Arguments of ``bathyscope evaluate``, arranged so that one command serves all ways of asking.
 
 ::
 
     bathyscope evaluate FOLDER...                               a bundle on folders, at once
     bathyscope evaluate --protocol P --data D... --systems S... a whole evaluation
     bathyscope evaluate diff A B                                two evaluations, frame by frame
+    bathyscope evaluate trajectory TRUE PREDICTED               two trajectories
 """
 
 from __future__ import annotations

@@ -145,6 +145,22 @@ def run_diff(
     typer.echo(comparison_text(compare(open_side(first, names[0]), open_side(second, names[-1]), metric)))
 
 
+@app.command(name="trajectory")
+def run_trajectory(
+    true: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="True cameras, TUM text.")],
+    predicted: Annotated[Path, typer.Argument(exists=True, dir_okay=False, help="Predicted cameras, TUM text.")],
+    *,
+    gap: Annotated[int, typer.Option(min=1, help="Frames between the cameras of a pair.")] = FRAME_GAP,
+) -> None:
+    """Compare two trajectory files after a Sim(3) alignment; prints JSON."""
+    from bathyscope_train.evaluation.trajectory_files import compare_files
+
+    scores, unmatched = compare_files(true, predicted, gap=gap)
+    typer.echo(scores.model_dump_json(indent=1))
+    if unmatched:
+        typer.echo(f"{unmatched} frames of {true} have no prediction", err=True)
+
+
 @contextmanager
 def _progress() -> Iterator[Any]:
     """A bar on a terminal, a line for each new step elsewhere; both on stderr."""
