@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from bathyscope.errors import SettingsError
+from bathyscope_train.consistency.plan import make_plan
 from bathyscope_train.consistency.settings import ConsistencySettings, load_consistency_settings
 from bathyscope_train.consistency.trainer import optimise
 from bathyscope_train.model import Network, get_preset
@@ -125,3 +126,15 @@ def test_what_cannot_be_trained_is_refused(
 ) -> None:
     with pytest.raises(SettingsError, match=message):
         optimise(settings(tmp_path, weights, **changes))
+
+
+def test_a_plan_says_what_is_trained_and_what_memory_it_takes(tmp_path: Path, weights: Path) -> None:
+    plan = make_plan(settings(tmp_path, weights))
+    network = VideoDepthAnything(SIZES["s"])
+    head = sum(value.numel() for value in network.head.parameters())
+    assert plan.preset == "vda-s"
+    assert sum(plan.counts) == head
+    assert plan.frozen == sum(value.numel() for value in network.pretrained.parameters())
+    assert plan.memory.parts["AdamW"] == 2 * 4 * head
+    assert plan.memory.parts["activations"] > 7 * 4 * 56 * 70
+    assert "head" in str(plan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -17,7 +17,8 @@ from bathyscope_train.consistency.settings import ConsistencySettings
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import NetworkPreset
 
-_FLOAT = 4
+FLOAT = 4
+"""Bytes of a number."""
 _GAUSSIAN_FLOATS = 3 + 4 + 3 + 1
 """Mean, rotation, scales and opacity; colour comes on top."""
 _PLANES = 5
@@ -71,12 +72,12 @@ def expected_memory(
         "AdamW": 2 * trained,
         "running average": everything if settings.ema_decay > 0 else 0,
         "frames": frames * 3 * size[0] * size[1],
-        "activations": activations // _FLOAT,
+        "activations": activations // FLOAT,
         # the scene itself, its gradient, and once more while each is put together
         "Gaussians": 4 * gaussians * (_GAUSSIAN_FLOATS + colour),
         "rendered views": 2 * views * _PLANES * size[0] * size[1] if gaussians else 0,
     }
-    return Memory({name: _FLOAT * floats for name, floats in parts.items() if floats})
+    return Memory({name: FLOAT * floats for name, floats in parts.items() if floats})
 
 
 def _activations(network: Network, settings: ConsistencySettings, size: tuple[int, int], clips: int) -> int:
@@ -86,17 +87,25 @@ def _activations(network: Network, settings: ConsistencySettings, size: tuple[in
     trunk = any(value.requires_grad for value in network.aggregator.parameters())
     if trunk and settings.checkpoint_activations:
         checkpoint_blocks(network)
+    images = torch.zeros(clips, settings.window.frames, 3, *size)
+    return saved_bytes(
+        network.parameters(),
+        lambda: dense_maps(network, encode(network, images, trained=trunk), images, settings.dense_chunk),
+    )
+
+
+def saved_bytes(parameters: Iterable[Tensor], forward: Callable[[], object]) -> int:
+    """Bytes that autograd keeps of a call, each storage once and without that of ``parameters``."""
     kept: dict[StorageWeakRef, int] = {}
 
     def keep(value: Tensor) -> Tensor:
         kept[StorageWeakRef(value.untyped_storage())] = value.untyped_storage().nbytes()
         return value
 
-    images = torch.zeros(clips, settings.window.frames, 3, *size)
     with torch.autograd.graph.saved_tensors_hooks(keep, lambda value: value):
-        maps = dense_maps(network, encode(network, images, trained=trunk), images, settings.dense_chunk)
-    own = {StorageWeakRef(value.untyped_storage()) for value in network.parameters()}
-    del maps  # until here it held what was kept
+        result = forward()
+    own = {StorageWeakRef(value.untyped_storage()) for value in parameters}
+    del result  # until here it held what was kept
     return sum(size for storage, size in kept.items() if storage not in own)
 
 

@@ -7,14 +7,19 @@ from dataclasses import dataclass
 
 import yaml
 
-from bathyscope.errors import DatasetError, SettingsError
+from bathyscope.errors import DatasetError
 from bathyscope.vision.grid import choose_size
 from bathyscope_train.consistency.clip_step import check_objective
 from bathyscope_train.consistency.memory import Memory, expected_memory
 from bathyscope_train.consistency.parts import Group, trained_groups
 from bathyscope_train.consistency.settings import ConsistencySettings
 from bathyscope_train.consistency.start import load_initial, open_videos_of, video_kind
+from bathyscope_train.consistency.video_memory import expected_video_memory
+from bathyscope_train.consistency.video_run import check_video_settings
 from bathyscope_train.data.datasets.sequence import DataSequence
+from bathyscope_train.model.network import Network
+from bathyscope_train.systems.vda.network import VideoDepthAnything
+from bathyscope_train.systems.vda.system import is_metric, load_vda
 
 _NAMED = 5
 
@@ -76,12 +81,7 @@ def make_plan(settings: ConsistencySettings, *, processes: int = 1) -> Plan:
         CheckpointError: If the initial checkpoint cannot be used.
         DatasetError: If the data holds no video.
     """
-    if video_kind(settings.init, settings.preset) is not None:
-        raise SettingsError(
-            f"{settings.init}: --dry-run plans runs of our own network; try a video network with steps=1 warmup_steps=0"
-        )
-    network = load_initial(settings.init, settings.preset)
-    check_objective(network, settings)
+    network, name = _initial(settings)
     groups = trained_groups(network, settings.parts)
     opened = open_videos_of(settings)
     numbers = {name: value.numel() for name, value in network.named_parameters()}
@@ -90,7 +90,7 @@ def make_plan(settings: ConsistencySettings, *, processes: int = 1) -> Plan:
     clips = max(settings.batch // (processes * settings.accumulate), 1)
     return Plan(
         settings=settings,
-        preset=network.preset.name,
+        preset=name,
         groups=tuple(groups),
         counts=tuple(counts),
         frozen=sum(numbers.values()) - sum(counts),
@@ -98,8 +98,31 @@ def make_plan(settings: ConsistencySettings, *, processes: int = 1) -> Plan:
         frames=sum(len(sequence) for sequence in opened.sequences),
         notes=opened.notes,
         size=size,
-        memory=expected_memory(network.preset, groups, settings, size, clips),
+        memory=_memory(network, groups, settings, size, clips),
     )
+
+
+def _initial(settings: ConsistencySettings) -> tuple[Network | VideoDepthAnything, str]:
+    """The network that training starts from, checked, and what it is called."""
+    kind = video_kind(settings.init, settings.preset)
+    if kind is not None:
+        check_video_settings(settings, metric=is_metric(kind.name))
+        return load_vda(settings.init, kind.name), kind.name
+    network = load_initial(settings.init, settings.preset)
+    check_objective(network, settings)
+    return network, network.preset.name
+
+
+def _memory(
+    network: Network | VideoDepthAnything,
+    groups: list[Group],
+    settings: ConsistencySettings,
+    size: tuple[int, int],
+    clips: int,
+) -> Memory:
+    if isinstance(network, Network):
+        return expected_memory(network.preset, groups, settings, size, clips)
+    return expected_video_memory(network.settings, groups, settings, size, clips)
 
 
 def largest_size(sequences: Sequence[DataSequence], settings: ConsistencySettings) -> tuple[int, int]:
