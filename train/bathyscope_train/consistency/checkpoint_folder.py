@@ -98,6 +98,18 @@ def write_checkpoint(
     return folder
 
 
+def write_weights(path: Path, network: nn.Module, training: Mapping[str, Any]) -> None:
+    """Write the weights that a run ends with.
+
+    Raises:
+        CheckpointError: If they cannot be written; they are in the last checkpoint too.
+    """
+    try:
+        save_checkpoint(network, path, training=training)
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(_failure(path, path.parent, error)) from error
+
+
 def read_last_checkpoint(run: Path) -> Kept | None:
     """The newest checkpoint of a run; None where there is none.
 

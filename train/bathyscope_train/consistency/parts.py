@@ -35,7 +35,7 @@ def learning_rate(step: int, settings: ConsistencySettings) -> float:
 
 
 def trained_groups(network: nn.Module, parts: Mapping[str, PartSettings]) -> list[Group]:
-    """The parameters that are ever trained; matrices and kernels apart, which alone decay.
+    """The parameters that are ever trained; matrices and kernels, which alone decay, apart.
 
     Args:
         network: Whose parameters are named.
@@ -52,7 +52,7 @@ def trained_groups(network: nn.Module, parts: Mapping[str, PartSettings]) -> lis
             continue
         seen.add(part)
         if parts[part].rate > 0:
-            decayed = parameter.ndim >= 2 and "token" not in name
+            decayed = parameter.ndim >= 2 and "token" not in name.rpartition(".")[2]
             found.setdefault((part, decayed), []).append(name)
     _check_named(network, parts, seen)
     return [Group(part, parts[part], decayed, tuple(names)) for (part, decayed), names in found.items()]

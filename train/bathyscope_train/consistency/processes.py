@@ -1,6 +1,6 @@
 """Several processes that train one network, as ``torchrun`` starts them; without it, this one alone.
 
-    torchrun --no-python --nproc-per-node 2 bathyscope train configs/consistency.yaml data=FOLDER init=CHECKPOINT batch=2
+    torchrun --no-python --nproc-per-node 2 bathyscope train configs/consistency.yaml data=FOLDER init=FILE batch=2
 
 Every process works through its share of each batch; gradients are averaged by ``DistributedDataParallel``.
 """

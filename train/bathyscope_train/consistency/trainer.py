@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,16 +12,16 @@ import torch
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 
-from bathyscope.errors import SettingsError
+from bathyscope.errors import GeometryError, SettingsError
 from bathyscope_train.consistency.batches import balanced_weights, mean_over, parts_of
-from bathyscope_train.consistency.checkpoint_folder import Kept, read_last_checkpoint, write_checkpoint
+from bathyscope_train.consistency.checkpoint_folder import Kept, read_last_checkpoint, write_checkpoint, write_weights
 from bathyscope_train.consistency.clip_step import TOTAL, ClipStep
 from bathyscope_train.consistency.optimizer_state import optimizer_tensors, restore_optimizer
 from bathyscope_train.consistency.parts import learning_rate, optimizer_groups, set_trainable, trained_groups
 from bathyscope_train.consistency.pictures import picture_grid
 from bathyscope_train.consistency.processes import Processes, joined
 from bathyscope_train.consistency.records import check_same_run, training_record, write_settings
-from bathyscope_train.consistency.reports import Reports
+from bathyscope_train.consistency.reports import Reports, mean_numbers
 from bathyscope_train.consistency.settings import ConsistencySettings
 from bathyscope_train.consistency.start import load_initial, open_training_windows, video_kind
 from bathyscope_train.consistency.video_step import VideoStep
@@ -30,7 +31,6 @@ from bathyscope_train.data.clip_sources import sources_hash
 from bathyscope_train.data.clip_windows import ClipWindows
 from bathyscope_train.devices import use_bfloat16
 from bathyscope_train.losses.supervised import splatting
-from bathyscope_train.model.checkpoints import save_checkpoint
 from bathyscope_train.model.network import Network
 from bathyscope_train.schedule import ema_decay
 
@@ -130,7 +130,7 @@ class ConsistencyRun:
                 self._validate()
         path = settings.out / WEIGHTS_FILE
         if self.processes.first:
-            save_checkpoint(self._result(), path, training=training_record(settings, self.step))
+            write_weights(path, self._result(), training=training_record(settings, self.step))
         self.processes.wait()
         return path
 
@@ -147,12 +147,9 @@ class ConsistencyRun:
         batch = next(self.loader)
         self.optimizer.zero_grad(set_to_none=True)
         parts = self._parts(batch)
-        values: dict[str, Tensor] = {}
-        for number, part in enumerate(parts):
-            found = self._forward_backward(part, last=number == len(parts) - 1)
-            values = {name: values.get(name, 0) + value.detach() / len(parts) for name, value in found.items()}
-        numbers = mean_over(values, self.processes)
-        self.watch.see(self.step, numbers, batch.names)
+        found = [self._forward_backward(part, batch.names, last=part is parts[-1]) for part in parts]
+        numbers = mean_numbers(found)
+        self.watch.see(self.step, numbers)
         norm = nn.utils.clip_grad_norm_(self._trained(), settings.clip_norm)
         rate = learning_rate(self.step, settings)
         for group, made in zip(self.groups, self.optimizer.param_groups, strict=True):
@@ -167,17 +164,24 @@ class ConsistencyRun:
         self.step += 1
         return {**numbers, "gradient_norm": float(norm), "rate": rate}, batch
 
-    def _forward_backward(self, part: tuple[Any, ...], *, last: bool) -> dict[str, Tensor]:
-        """One part of a batch forward and back; gradients are exchanged with the last."""
-        shared, count = self.shared, self.settings.accumulate
-        if isinstance(shared, DistributedDataParallel) and not last:
-            with shared.no_sync():
+    def _forward_backward(self, part: tuple[Any, ...], clips: tuple[str, ...], *, last: bool) -> dict[str, float]:
+        """One part of a batch forward and back; gradients are exchanged with the last. Returns all processes' numbers.
+
+        Raises:
+            TrainingError: If a number is not finite; nothing has been updated then.
+        """
+        shared = self.shared
+        waits = isinstance(shared, DistributedDataParallel) and not last
+        exchange = cast(DistributedDataParallel, shared).no_sync() if waits else nullcontext()
+        try:
+            with exchange:
                 found: dict[str, Tensor] = shared(*part, self.progress)
-                (found[TOTAL] / count).backward()
-            return found
-        found = shared(*part, self.progress)
-        (found[TOTAL] / count).backward()
-        return found
+                numbers = mean_over(found, self.processes)
+                self.watch.check_finite(self.step, numbers, clips)
+                (found[TOTAL] / self.settings.accumulate).backward()
+        except GeometryError as error:
+            raise self.watch.broken(self.step, str(error), clips) from error
+        return numbers
 
     @property
     def progress(self) -> float:

@@ -20,18 +20,30 @@ class Watch:
     recent: deque[float] = field(default_factory=deque)
     skipped: int = 0
 
-    def see(self, step: int, values: Mapping[str, float], clips: Sequence[str]) -> None:
-        """Judge the numbers of a step.
+    def check_finite(self, step: int, values: Mapping[str, float], clips: Sequence[str]) -> None:
+        """Look at the numbers of a step before anything follows from them.
 
         Raises:
-            TrainingError: If a number is not finite, or depth has lost its variation over the last steps.
+            TrainingError: If one is not finite.
         """
         bad = [name for name, value in values.items() if not math.isfinite(value)]
         if bad:
-            raise TrainingError(
-                f"step {step}: {', '.join(bad)} not finite on {', '.join(clips)}. Try a smaller peak_lr, a smaller "
-                "clip_norm or precision=float32; if it is always this clip, look at it, or leave it out"
-            )
+            raise self.broken(step, f"{', '.join(bad)} not finite", clips)
+
+    @staticmethod
+    def broken(step: int, what: str, clips: Sequence[str]) -> TrainingError:
+        """The error for numbers that cannot be gone on with, and what to try."""
+        return TrainingError(
+            f"step {step}: {what}, on {', '.join(clips)}. Try a smaller peak_lr, a smaller clip_norm or "
+            "precision=float32; if it is always this clip, look at it, or leave it out. The last checkpoint is good"
+        )
+
+    def see(self, step: int, values: Mapping[str, float]) -> None:
+        """Judge the numbers of a step that was taken.
+
+        Raises:
+            TrainingError: If depth has lost its variation over the last steps.
+        """
         self.recent.append(values[VARIATION])
         while len(self.recent) > self.settings.steps:
             self.recent.popleft()
