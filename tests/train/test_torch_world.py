@@ -8,7 +8,15 @@ import pytest
 import torch
 
 from bathyscope.errors import SettingsError
-from bathyscope_train.data.synthetic import DOMAINS, Domain, lens, torch_support
+from bathyscope_train.data.synthetic import (
+    DOMAINS,
+    Domain,
+    lens,
+    torch_layout,
+    torch_rendering,
+    torch_support,
+    torch_tracing,
+)
 from bathyscope_train.data.synthetic.clip import ClipPlan, plan_clip, render_frame_of
 from bathyscope_train.data.synthetic.optics import develop, form_image
 from bathyscope_train.data.synthetic.shutter import image_motion
@@ -66,6 +74,23 @@ def test_radiance_depth_and_movers_are_those_of_the_kernels(family: str, alive: 
         assert off.mean() < 0.005
         assert (mover != expected_mover).mean() < 0.005
         assert np.abs(light.transpose(0, 2, 3, 1) - expected_light).mean() < 1e-3 * expected_light.mean()
+
+
+@pytest.mark.slow
+def test_compiled_rendering_is_the_same_and_made_of_whole_graphs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without the backend, whose code depends on the device: what is compiled, and how often, is the same."""
+    monkeypatch.setattr(torch_layout, "_BACKEND", "eager")
+    torch_layout.compiled.cache_clear()
+    torch._dynamo.reset()
+    counters = torch._dynamo.utils.counters
+    counters.clear()
+    plans = [plan_clip(0, lively("cavity", alive=1.0), frames=1, size=(16, 24))]
+    expected = render_scenes(scene_tensors(plans, "cpu"), (16, 24))
+    observed = render_scenes(scene_tensors(plans, "cpu", compiled=True), (16, 24))
+    torch_layout.compiled.cache_clear()
+    torch.testing.assert_close(tuple(observed), tuple(expected), rtol=1e-4, atol=1e-5)
+    assert not counters["graph_break"]
+    assert counters["stats"]["unique_graphs"] <= 12  # for all numbers of rays
 
 
 SENSORS: dict[str, dict[str, object]] = {
@@ -140,6 +165,26 @@ def test_the_noise_is_that_of_the_generator() -> None:
     )
     assert torch.equal(first, again)
     assert not torch.equal(first, other)
+
+
+@pytest.mark.slow
+def test_rendering_needs_nothing_from_another_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the meta device every tensor of another device is an error; which rays go on cannot be asked there."""
+
+    def few(mask: torch.Tensor) -> torch_layout.Chosen:
+        index = torch.arange(5, device=mask.device)
+        return torch_layout.Chosen(index, index // mask.shape[1])
+
+    for module in (torch_layout, torch_rendering):
+        monkeypatch.setattr(module, "marked", few)
+    for rounds in ("_MARCH", "_REFINE"):
+        monkeypatch.setattr(torch_tracing, rounds, (1, 1))
+    domain = lively("lumen", alive=0.5)
+    domain = domain.model_copy(update={"families": {"lumen": 1.0, "cavity": 1.0, "indoor": 1.0}})
+    batch = render_clips(range(10), domain, frames=2, size=(16, 20), device="meta")
+    assert {name.split("-")[1] for name in batch.names} == {"lumen", "cavity", "indoor"}
+    assert batch.frames.device.type == "meta"
+    assert batch.frames.shape == (10, 2, 3, 16, 20)
 
 
 @pytest.mark.parametrize(
