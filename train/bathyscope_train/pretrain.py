@@ -263,6 +263,7 @@ def draw_solver_input(random: np.random.Generator, frames: int, *, certain: bool
         focal_error=error,
         true_motion=bool(certain or motion),
         hint_error=float(random.uniform(0, _HINT_ERROR)) if hint else None,
+        hint_seed=int(random.integers(2**31)),
         held_out=int(random.integers(frames)),
     )
 

@@ -60,6 +60,7 @@ class SolverInput:
     hint_error: float | None = None
     """Let the last look follow the true motions, each turned and shifted by about this share of itself, as the steps
     from frame to frame would lead it; None for the motions of the first look."""
+    hint_seed: int = 0
     held_out: int = 0
     """Frame that the others' Gaussians have to show."""
 
@@ -126,7 +127,7 @@ def _camera_terms(
     if given.hint_error is None:
         estimates = head.estimate(clip, first, pairs)
     else:
-        hint = disturbed(true.motion, given.hint_error)
+        hint = disturbed(true.motion, given.hint_error, given.hint_seed)
         shape = (batch.focal.shape[0], pairs.source.shape[0])
         per_clip = Motion(hint.rotation.unflatten(0, shape), hint.translation.unflatten(0, shape))
         estimates = head.estimate(clip, first, pairs, between=lambda motion: per_clip)
@@ -151,14 +152,12 @@ def _camera_terms(
     }, corrected
 
 
-def disturbed(motion: Motion, share: float) -> Motion:
+def disturbed(motion: Motion, share: float, seed: int) -> Motion:
     """Motions with their rotation vectors and translations off by about ``share`` of their lengths."""
-    angles = rotation_logarithm(motion.rotation)
-    wrong = [
-        each + share * length(each)[..., None] * torch.randn_like(each) / 3**0.5
-        for each in (angles, motion.translation)
-    ]
-    return Motion(rotation_exponential(wrong[0]), wrong[1])
+    both = torch.stack([rotation_logarithm(motion.rotation), motion.translation])
+    noise = torch.randn(both.shape, generator=torch.Generator().manual_seed(seed)).to(both)
+    angles, translation = both + share * length(both)[..., None] * noise / 3**0.5
+    return Motion(rotation_exponential(angles), translation)
 
 
 def splatting(device: torch.device) -> Renderer:
