@@ -86,6 +86,24 @@ def test_depth_has_a_gradient_and_given_cameras_have_none_of_their_own(settings:
     assert float(found["anchor"]) == pytest.approx(0, abs=1e-6)
 
 
+@pytest.mark.parametrize("cameras", ["given", "before"])
+def test_cameras_of_before_stay_where_depth_moves_and_given_ones_follow(tmp_path: Path, cameras: str) -> None:
+    settings = run_settings(tmp_path, tmp_path, tmp_path, cameras=cameras)
+    network, clip = uneven_network(), images()
+    set_trainable(network, trained_groups(network, settings.parts), 0, settings)
+    step = ClipStep(network, settings, CpuRenderer())
+    now, before = step.geometry(clip, INSIDE)
+    torch.testing.assert_close(now.world_from_camera, before.world_from_camera, rtol=1e-3, atol=1e-5)
+    torch.testing.assert_close(now.depth, before.depth)
+    with torch.no_grad():
+        list(network.depth_head.parameters())[-1].add_(0.5)  # the bias of log depth
+    now, before = step.geometry(clip, INSIDE)
+    grown = (now.depth / before.depth).mean().item()
+    assert grown > 1.4
+    ratio = now.world_from_camera[0, -1, :3, 3].norm() / before.world_from_camera[0, -1, :3, 3].norm()
+    assert float(ratio.detach()) == pytest.approx(1 if cameras == "before" else grown, rel=0.02)
+
+
 def test_what_is_outside_the_field_of_view_is_no_gaussian_and_learns_nothing() -> None:
     network, clip = uneven_network(), images()
     inside = INSIDE.clone()

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bathyscope.errors import SettingsError
-from bathyscope_train.consistency.geometry import ClipGeometry, encode, predict
+from bathyscope_train.consistency.geometry import ClipGeometry, encode, predict, predict_before
 from bathyscope_train.consistency.objective import consistency_terms, weighted_sum
 from bathyscope_train.consistency.rendering import ClipRendering, render_clip
 from bathyscope_train.consistency.settings import ConsistencySettings
@@ -73,6 +73,9 @@ class ClipStep(nn.Module):
         """Of the network as it is, and as it was before training."""
         settings = self.settings
         features = encode(self.network, images, trained=self.trunk_trained, autocast=self.autocast)
+        with torch.no_grad():
+            own = encode(self.before, images, trained=False, autocast=self.autocast) if self.trunk_trained else features
+            before, solved = predict_before(self.before, own, images, focal)
         frozen = not any(value.requires_grad for value in self.network.camera_head.parameters())
         geometry = predict(
             self.network,
@@ -80,13 +83,10 @@ class ClipStep(nn.Module):
             images,
             inside,
             focal,
-            given_cameras=frozen and settings.cameras == "given",
+            cameras="given" if frozen and settings.cameras == "given" else "through",
+            before=solved if frozen and settings.cameras == "before" else None,
             chunk=settings.dense_chunk,
         )
-        with torch.no_grad():
-            if self.trunk_trained:
-                features = encode(self.before, images, trained=False, autocast=self.autocast)
-            before = predict(self.before, features, images, inside, focal)
         return geometry, before
 
     @torch.no_grad()

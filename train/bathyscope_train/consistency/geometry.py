@@ -1,7 +1,7 @@
 """What the network says about clips, as geometry: depth, cameras and Gaussians in one world."""
 
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Literal, cast
 
 import torch
 from jaxtyping import Bool, Float
@@ -31,6 +31,15 @@ class ClipGeometry:
     """None for a network without a Gaussian head."""
 
 
+@dataclass(frozen=True, slots=True)
+class SolvedBefore:
+    """What the network said before training, to be kept: cameras in a unit that depth cannot change any more."""
+
+    pose_encodings: Float[Tensor, "i b t 9"]
+    correction: Float[Tensor, "b t h w"]
+    """Factor from the depth head's depth to the corrected one."""
+
+
 def encode(network: Network, images: Float[Tensor, "b t 3 h w"], *, trained: bool, autocast: bool = False) -> Features:
     """Tokens of the transformer, in bfloat16 if ``autocast``; without gradients unless it is ``trained``."""
     with (
@@ -47,7 +56,8 @@ def predict(
     inside: Bool[Tensor, "b h w"],
     focal: Float[Tensor, "b"] | None = None,
     *,
-    given_cameras: bool = False,
+    cameras: Literal["given", "through"] = "through",
+    before: SolvedBefore | None = None,
     chunk: int | None = None,
 ) -> ClipGeometry:
     """Heads and scene, in float32.
@@ -58,16 +68,33 @@ def predict(
         images: RGB in [0, 1].
         inside: Field of view; what is outside never becomes a Gaussian.
         focal: Focal length in pixels where known, 0 elsewhere.
-        given_cameras: Send no gradient through the camera head, see :func:`given_solution`.
+        cameras: Whether gradients go through the camera head, or it is taken as given, see :func:`given_solution`.
+        before: Cameras and correction of depth to take instead of asking the camera head.
         chunk: Frames that the dense heads work on at once; what they keep is worked out again going back.
     """
     maps = dense_maps(network, features, images, chunk)
-    if given_cameras:
+    if before is not None:
+        solved = CameraSolution(before.pose_encodings, maps.depth * before.correction)
+    elif cameras == "given":
         solved = given_solution(network, features, maps.depth, focal)
     else:
         solved = network.cameras(features, maps.depth, focal)
     maps = replace(maps, depth=solved.depth, gaussians=_only_inside(maps.gaussians, inside))
     return assemble(network, Prediction(solved.pose_encodings, maps), images)
+
+
+@torch.no_grad()
+def predict_before(
+    network: Network,
+    features: Features,
+    images: Float[Tensor, "b t 3 h w"],
+    focal: Float[Tensor, "b"] | None = None,
+) -> tuple[ClipGeometry, SolvedBefore]:
+    """Depth and cameras of the network before training, which has no Gaussian head, and how they came about."""
+    maps = network.dense(features, images)
+    solved = network.cameras(features, maps.depth, focal)
+    geometry = assemble(network, Prediction(solved.pose_encodings, replace(maps, depth=solved.depth)), images)
+    return geometry, SolvedBefore(solved.pose_encodings, solved.depth / maps.depth)
 
 
 def given_solution(

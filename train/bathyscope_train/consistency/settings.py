@@ -88,9 +88,10 @@ class ConsistencySettings(BaseModel, frozen=True, extra="forbid"):
     balance_steps: NonNegativeInt = Field(
         default=0, description="Steps measured beforehand, to read the weights as shares of the sum. Not in the paper."
     )
-    cameras: Literal["given", "through"] = Field(
+    cameras: Literal["given", "before", "through"] = Field(
         default="given",
-        description="Of a head that solves for motion while it is frozen: taken as given, or differentiated through.",
+        description="While the camera head is frozen: what it says of depth as it is now, taken as given; what it said "
+        "before training; or differentiated through.",
     )
     cameras_from: str | None = Field(
         default=None,
