@@ -111,6 +111,13 @@ def test_an_experiment_hands_overrides_to_its_runs() -> None:
     assert settings.run_settings("all", 0).loss.world.weight == 1
 
 
+def test_the_stability_experiment_is_five_runs_of_one_clip_a_step() -> None:
+    settings = load_ablation_settings(CONFIGS / "stability.yaml", ["init=a.safetensors"])
+    runs = [settings.run_settings("batch of one", seed) for seed in settings.seeds]
+    assert [(run.batch, run.accumulate, run.seed) for run in runs] == [(1, 1, seed) for seed in range(5)]
+    assert all(run.validation == (settings.target,) for run in runs)
+
+
 def test_an_initial_checkpoint_of_another_preset_is_refused_by_name(tmp_path: Path) -> None:
     path = write_init(tmp_path / "start.safetensors")
     with pytest.raises(

@@ -55,6 +55,8 @@ def optimise(settings: ConsistencySettings) -> Path:
     if settings.threads is not None:
         torch.set_num_threads(settings.threads)
     with joined(settings.device) as processes:
+        if not processes.first:
+            logging.getLogger().setLevel(logging.WARNING)
         run = run_of(settings)(settings, processes)
         try:
             return run.train()
