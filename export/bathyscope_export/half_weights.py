@@ -6,22 +6,12 @@ agree with PyTorch to float32's precision; what the rounding itself costs is for
 
 import numpy as np
 import onnx
-import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
-from torch import nn
 
 from bathyscope_export.weights import INLINE_BYTES
 
 _SUFFIX = ".bfloat16"
-
-
-def round_to_bfloat16(network: nn.Module) -> None:
-    """Round matrices and kernels to what bfloat16 can hold; vectors (biases, norms) keep all bits."""
-    with torch.no_grad():
-        for parameter in network.parameters():
-            if parameter.ndim > 1:
-                parameter.copy_(parameter.to(torch.bfloat16).to(parameter.dtype))
 
 
 def halve_weights(model: onnx.ModelProto) -> None:

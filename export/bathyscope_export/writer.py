@@ -22,10 +22,11 @@ from bathyscope.errors import BundleError
 from bathyscope.model_spec import InputSpec
 from bathyscope_export.card import write_card
 from bathyscope_export.graph import export_stage
-from bathyscope_export.half_weights import halve_weights, round_to_bfloat16
+from bathyscope_export.half_weights import halve_weights
 from bathyscope_export.parity import SHAPES, compare
 from bathyscope_export.stages import Stage, split
 from bathyscope_export.weights import externalise
+from bathyscope_train.model.half_precision import round_to_bfloat16
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.specs import scene_spec
 

@@ -9,8 +9,9 @@ import torch
 from onnx import TensorProto, helper, numpy_helper
 from torch import nn
 
-from bathyscope_export.half_weights import halve_weights, round_to_bfloat16
+from bathyscope_export.half_weights import halve_weights
 from bathyscope_export.weights import externalise
+from bathyscope_train.model.half_precision import round_to_bfloat16
 
 
 def product(weights: np.ndarray) -> onnx.ModelProto:

@@ -18,6 +18,7 @@ from torch import Tensor
 from bathyscope.errors import CheckpointError
 from bathyscope_train.model import Network, NetworkPreset
 from bathyscope_train.model.checkpoints import load_network, load_weights, save_checkpoint, training_of
+from bathyscope_train.model.half_precision import round_to_bfloat16
 from bathyscope_train.model.presets import AggregatorSettings, DptSettings, IterativeCameraSettings, VitSettings
 
 SMALL = NetworkPreset(
@@ -34,6 +35,24 @@ SMALL = NetworkPreset(
 def random_network(seed: int = 0) -> Network:
     torch.manual_seed(seed)
     return Network(SMALL).eval()
+
+
+def test_a_rounded_network_fits_into_half_the_file_and_comes_back_as_it_was(tmp_path: Path) -> None:
+    network = random_network()
+    round_to_bfloat16(network)
+    save_checkpoint(network, tmp_path / "whole.safetensors")
+    save_checkpoint(network, tmp_path / "half.safetensors", half=True)
+    loaded, report = load_network(tmp_path / "half.safetensors")
+    assert report.complete
+    assert_equal_weights(loaded, network.state_dict())
+    whole, half = ((tmp_path / f"{name}.safetensors").stat().st_size for name in ("whole", "half"))
+    assert half < 0.7 * whole  # the rest are vectors and names
+
+
+def test_what_does_not_fit_stays_whole(tmp_path: Path) -> None:
+    network = random_network()
+    save_checkpoint(network, tmp_path / "half.safetensors", half=True)
+    assert_equal_weights(load_network(tmp_path / "half.safetensors")[0], network.state_dict())
 
 
 def published(network: Network, prefix: str) -> dict[str, Tensor]:

@@ -17,6 +17,7 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from bathyscope.errors import CheckpointError
+from bathyscope_train.model.half_precision import halved
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import NetworkPreset
 from bathyscope_train.model.weight_files import WeightFile, open_weights
@@ -94,11 +95,24 @@ def names_its_network(weights: WeightFile) -> bool:
     return _PRESET in weights.metadata
 
 
-def save_checkpoint(network: nn.Module, path: Path | str, *, training: Mapping[str, Any] | None = None) -> None:
+def shipped_checkpoint() -> Path:
+    """The checkpoint of the shipped bundle: what a training on other videos starts from."""
+    return Path(__file__).parents[1] / "weights" / "tiny.safetensors"
+
+
+def save_checkpoint(
+    network: nn.Module, path: Path | str, *, training: Mapping[str, Any] | None = None, half: bool = False
+) -> None:
     """Write safetensors that carry the preset, if it is a network of ours, and, as JSON, how the weights came about.
 
     Others are told by the names of their tensors, as their published weights are. Written beside and renamed into
     place.
+
+    Args:
+        network: What is written.
+        path: Where.
+        training: How the weights came about.
+        half: Store what bfloat16 holds exactly as bfloat16; see :mod:`.half_precision`. Nothing is rounded here.
     """
     path = Path(path)
     metadata = {_TRAINING: json.dumps(dict(training or {}))}
@@ -106,6 +120,8 @@ def save_checkpoint(network: nn.Module, path: Path | str, *, training: Mapping[s
         metadata[_PRESET] = network.preset.model_dump_json()
     beside = path.with_name(path.name + ".part")
     tensors = {name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()}
+    if half:
+        tensors = {name: halved(value) for name, value in tensors.items()}
     save_file(tensors, beside, metadata=metadata)
     beside.replace(path)
 
