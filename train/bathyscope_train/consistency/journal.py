@@ -79,6 +79,10 @@ class Journal:
         )
         return {"seconds_per_step": round(each, 4), "clips_per_second": round(clips / max(each, 1e-9), 4)}
 
+    def restart_clock(self, step: int) -> None:
+        """Leave what took time until now, such as a validation, out of the speed."""
+        self._since, self._at = time.monotonic(), step
+
     def picture(self, step: int, name: str, image: NDArray[np.uint8]) -> None:
         """An RGB picture (h, w, 3) for TensorBoard."""
         if self._events is not None:

@@ -84,6 +84,7 @@ class Reports:
                 heads.abs_rel,
                 full.flicker,
             )
+        self.journal.restart_clock(step)
 
     def close(self) -> None:
         """Write what is left."""
