@@ -12,12 +12,20 @@ from typing import Any
 
 import pytest
 import torch
+from pydantic import TypeAdapter
 from safetensors.torch import save_file
 from torch import Tensor
 
 from bathyscope.errors import CheckpointError
 from bathyscope_train.model import Network, NetworkPreset
-from bathyscope_train.model.checkpoints import load_network, load_weights, save_checkpoint, training_of
+from bathyscope_train.model.checkpoints import (
+    CheckpointPath,
+    load_network,
+    load_weights,
+    save_checkpoint,
+    shipped_checkpoint,
+    training_of,
+)
 from bathyscope_train.model.half_precision import round_to_bfloat16
 from bathyscope_train.model.presets import AggregatorSettings, DptSettings, IterativeCameraSettings, VitSettings
 
@@ -277,3 +285,9 @@ def test_a_checkpoint_whose_preset_does_not_fit_is_refused(
     save_file(tensors, tmp_path / "a", metadata={"bathyscope.preset": preset})
     with pytest.raises(CheckpointError, match=message):
         load_network(tmp_path / "a")
+
+
+def test_settings_may_name_the_shipped_checkpoint() -> None:
+    wanted = TypeAdapter(CheckpointPath)
+    assert wanted.validate_python("shipped") == shipped_checkpoint()
+    assert wanted.validate_python("other.safetensors") == Path("other.safetensors")

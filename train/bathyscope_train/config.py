@@ -8,6 +8,7 @@ from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveIn
 
 from bathyscope.errors import SettingsError
 from bathyscope_train.losses.supervised import LossWeights
+from bathyscope_train.model.checkpoints import CheckpointPath
 from bathyscope_train.settings_files import read_settings_file
 
 
@@ -54,7 +55,9 @@ class PretrainSettings(BaseModel, frozen=True, extra="forbid"):
     validation: tuple[Path, ...] = Field(default=(), description="Folders of held-out clips, rendered or measured.")
     validation_clips: PositiveInt = Field(default=8, description="Clips taken from each validation folder.")
     out: Path
-    initial: Path | None = Field(default=None, description="Checkpoint (safetensors) to start from.")
+    initial: CheckpointPath | None = Field(
+        default=None, description="Checkpoint (safetensors) to start from; `shipped` for the one in the package."
+    )
     only: str = Field(default="", description="Train only parameters whose names start so, as gaussian_param_head.")
     minutes: PositiveFloat = Field(default=30.0, description="Wall-clock budget; the learning rate follows it.")
     steps: PositiveInt | None = Field(default=None, description="Budget in steps instead: the same bits for a seed.")

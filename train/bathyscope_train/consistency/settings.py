@@ -21,6 +21,7 @@ from bathyscope.errors import SettingsError
 from bathyscope_train.consistency.terms import ObjectiveSettings
 from bathyscope_train.data.clip_sources import ClipSource
 from bathyscope_train.data.clip_windows import WindowSettings
+from bathyscope_train.model.checkpoints import CheckpointPath
 from bathyscope_train.settings_files import read_settings_file
 
 TASK = "consistency"
@@ -61,7 +62,9 @@ class ConsistencySettings(BaseModel, frozen=True, extra="forbid"):
 
     task: Literal["consistency"] = "consistency"
     data: tuple[ClipSource, ...] = Field(min_length=1)
-    init: Path = Field(description="Checkpoint to start from: one of ours, or published weights with `preset`.")
+    init: CheckpointPath = Field(
+        description="Checkpoint to start from: `shipped`, one of ours, or published weights with `preset`."
+    )
     preset: str | None = Field(default=None, description="Network of `init`; needed where the file does not say.")
     out: Path = Path("runs/consistency")
     cache: Path | None = Field(default=None, description="Keeps what the first pass over videos found; out/survey.")

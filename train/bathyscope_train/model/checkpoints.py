@@ -9,10 +9,10 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import torch
-from pydantic import ValidationError
+from pydantic import BeforeValidator, ValidationError
 from safetensors.torch import save_file
 from torch import Tensor, nn
 
@@ -98,6 +98,14 @@ def names_its_network(weights: WeightFile) -> bool:
 def shipped_checkpoint() -> Path:
     """The checkpoint of the shipped bundle: what a training on other videos starts from."""
     return Path(__file__).parents[1] / "weights" / "tiny.safetensors"
+
+
+def _shipped_or_path(value: object) -> object:
+    return shipped_checkpoint() if value == "shipped" else value
+
+
+CheckpointPath = Annotated[Path, BeforeValidator(_shipped_or_path)]
+"""A path in settings; ``shipped`` stands for the checkpoint that comes with the package."""
 
 
 def save_checkpoint(
