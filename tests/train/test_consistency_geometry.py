@@ -172,6 +172,20 @@ def test_variation_is_that_within_frames_and_leaves_holes_out() -> None:
     assert float(within_frame_variation(depth, torch.ones(1, 4, 4, dtype=torch.bool))) == pytest.approx(float(expected))
 
 
+def test_pictures_show_the_image_as_the_loss_judges_it(settings: ConsistencySettings) -> None:
+    step = ClipStep(uneven_network(), settings, CpuRenderer())
+    shown = step.look(images(), INSIDE)
+    geometry, _ = step.geometry(images(), INSIDE)
+    drawn = render_clip(geometry, CpuRenderer(), settings.loss.image)
+    assert shown.image is not None
+    assert drawn.image is not None
+    assert drawn.image_opacity is not None
+    solid = drawn.image_opacity >= 0.05
+    assert float(solid.float().mean()) > 0.01
+    again = shown.image * torch.where(solid, drawn.image_opacity, 1)[:, :, None]
+    torch.testing.assert_close(again, drawn.image)
+
+
 def test_a_network_without_gaussians_is_not_asked_for_images(settings: ConsistencySettings) -> None:
     preset = get_preset("tiny").model_copy(update={"gaussians": None, "name": "bare"})
     with pytest.raises(SettingsError, match=r"'bare' has no Gaussians .* set loss.image.weight=0"):

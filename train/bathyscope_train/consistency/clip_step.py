@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Mapping
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,6 +13,7 @@ from bathyscope_train.consistency.geometry import ClipGeometry, encode, predict,
 from bathyscope_train.consistency.objective import consistency_terms, weighted_sum
 from bathyscope_train.consistency.rendering import ClipRendering, render_clip
 from bathyscope_train.consistency.settings import ConsistencySettings
+from bathyscope_train.losses.photometric import LEAST_OPACITY
 from bathyscope_train.model.blocks import Block
 from bathyscope_train.model.network import Network
 from bathyscope_train.render import Renderer
@@ -91,9 +93,15 @@ class ClipStep(nn.Module):
 
     @torch.no_grad()
     def look(self, images: Tensor, inside: Tensor, focal: Tensor | None = None) -> ClipRendering:
-        """What is rendered of clips, for pictures."""
+        """What is rendered of clips, for pictures: the image as the image term judges it."""
         geometry, _ = self.geometry(images, inside, focal)
-        return render_clip(geometry, self.renderer, self.settings.loss.image)
+        term = self.settings.loss.image
+        rendered = render_clip(geometry, self.renderer, term)
+        if not term.divide_by_opacity or rendered.image is None or rendered.image_opacity is None:
+            return rendered
+        opacity = rendered.image_opacity
+        share = opacity.where(opacity >= LEAST_OPACITY, torch.ones_like(opacity))
+        return replace(rendered, image=rendered.image / share[:, :, None])
 
     def weigh(self, weights: Mapping[str, float]) -> None:
         """Replace the factors of the terms."""
