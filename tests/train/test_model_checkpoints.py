@@ -16,6 +16,7 @@ from pydantic import TypeAdapter
 from safetensors.torch import save_file
 from torch import Tensor
 
+from bathyscope.bundle import Bundle, shipped_bundle
 from bathyscope.errors import CheckpointError
 from bathyscope_train.model import Network, NetworkPreset
 from bathyscope_train.model.checkpoints import (
@@ -291,3 +292,14 @@ def test_settings_may_name_the_shipped_checkpoint() -> None:
     wanted = TypeAdapter(CheckpointPath)
     assert wanted.validate_python("shipped") == shipped_checkpoint()
     assert wanted.validate_python("other.safetensors") == Path("other.safetensors")
+
+
+def test_the_shipped_checkpoint_is_that_of_the_shipped_bundle() -> None:
+    network, report = load_network(shipped_checkpoint())
+    assert report.complete
+    assert network.preset.name == "tiny"
+    bundle = Bundle.open(shipped_bundle())
+    assert training_of(shipped_checkpoint()) == bundle.manifest.training
+    weights = (bundle.folder / "weights.bin").read_bytes()
+    kernel = network.state_dict()["aggregator.patch_embed.to_half.0.weight"].to(torch.bfloat16)
+    assert kernel.view(torch.int16).numpy().tobytes() in weights
