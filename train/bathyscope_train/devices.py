@@ -27,5 +27,5 @@ def use_bfloat16(precision: str, device: torch.device | None = None) -> bool:
     if precision != "auto":
         return precision == "bfloat16"
     if device is not None and device.type == "cuda":
-        return torch.cuda.is_bf16_supported(including_emulation=False)
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
     return torch.cpu._is_amx_tile_supported()
