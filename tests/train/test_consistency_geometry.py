@@ -186,6 +186,24 @@ def test_pictures_show_the_image_as_the_loss_judges_it(settings: ConsistencySett
     torch.testing.assert_close(again, drawn.image)
 
 
+@pytest.mark.parametrize("views", ["all", "others"])
+def test_what_the_pairs_compare_is_rendered_or_where_each_frame_placed_its_gaussians(
+    settings: ConsistencySettings, views: str
+) -> None:
+    network, term = uneven_network(), settings.loss.image.model_copy(update={"views": views})
+    geometry = predict(network, encode(network, images(), trained=False), images(), INSIDE)
+    rendered = render_clip(geometry, CpuRenderer(), term)
+    placed = render_clip(geometry, CpuRenderer(), term, depth="placed")
+    assert (placed.depth == geometry.depth).all()
+    assert (placed.opacity == 1).all()
+    assert not torch.allclose(rendered.depth, geometry.depth, rtol=1e-3)
+    assert placed.image is not None
+    assert rendered.image is not None
+    assert (placed.image == rendered.image).all()
+    bare = render_clip(geometry, CpuRenderer(), term.model_copy(update={"weight": 0}), depth="placed")
+    assert bare.image is None
+
+
 def test_a_network_without_gaussians_is_not_asked_for_images(settings: ConsistencySettings) -> None:
     preset = get_preset("tiny").model_copy(update={"gaussians": None, "name": "bare"})
     with pytest.raises(SettingsError, match=r"'bare' has no Gaussians .* set loss.image.weight=0"):

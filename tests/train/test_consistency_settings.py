@@ -28,7 +28,7 @@ def test_the_shipped_settings_are_the_papers() -> None:
     settings = load_consistency_settings(CONFIGS / "consistency.yaml", GIVEN)
     assert (settings.steps, settings.warmup_steps, settings.peak_lr) == (20_000, 2_000, 2e-4)
     assert (settings.window.frames, settings.loss.world.stride, settings.loss.temporal.stride) == (16, 6, 6)
-    assert settings.loss.weights == {"image": 1, "world": 1, "temporal": 1, "anchor": 0}
+    assert settings.loss.weights == {"image": 1, "world": 1, "temporal": 1, "matches": 0, "anchor": 0}
     assert settings.parts["camera_head"].after_warmup
     fresh = load_consistency_settings(CONFIGS / "consistency-small.yaml", [*GIVEN, "steps=20001", "batch=8"])
     assert (fresh.steps, fresh.batch) == (20_001, 8)
@@ -161,7 +161,7 @@ def test_a_dry_run_prints_settings_groups_and_memory_and_writes_nothing(tmp_path
     assert found.exit_code == 0, found.output
     network = uneven_network()
     depth = sum(value.numel() for value in network.depth_head.parameters() if value.ndim >= 2)
-    for text in ("steps: 150", f"{depth:,}", "2 videos, 16 frames", "frozen", "activations", "together"):
+    for text in ("steps: 40", f"{depth:,}", "2 videos, 16 frames", "frozen", "activations", "together"):
         assert text in found.output
     assert not out.exists()
 

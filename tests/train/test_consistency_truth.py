@@ -44,6 +44,18 @@ def test_the_world_loss_prefers_the_truth(clip: TrueClip, fixed: bool) -> None:
         assert float(world_consistency_loss(*wrong.geometry, stride=STRIDE, meets=meets)) > 1.5 * truth, name
 
 
+@pytest.mark.slow
+def test_depth_rendered_from_all_frames_hides_that_they_disagree(clip: TrueClip) -> None:
+    """Nearly transparent Gaussians are averaged over the frames, and one world always agrees with itself."""
+    flickering = wrong_depths(clip)["flicker 10 %"]
+    scene = painted(flickering)
+    scene = replace(scene, opacities=0.1 * scene.opacities)
+    view = CpuRenderer(threads=1)(scene, clip.world_from_camera, clip.intrinsics, clip.size)
+    rendered = replace(flickering, depth=view.depth, valid=clip.valid & (view.opacity > 0.3))
+    placed_loss = float(world_consistency_loss(*flickering.geometry, stride=STRIDE))
+    assert float(world_consistency_loss(*rendered.geometry, stride=STRIDE)) < 0.2 * placed_loss
+
+
 @pytest.mark.parametrize("fixed", [False, True], ids=["own valid set", "fixed valid set"])
 def test_the_compensated_edges_prefer_the_truth(clip: TrueClip, fixed: bool) -> None:
     meets = meeting_pixels(*clip.geometry, stride=STRIDE) if fixed else None

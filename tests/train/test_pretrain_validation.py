@@ -6,10 +6,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 
 from bathyscope.errors import DatasetError
 from bathyscope_train.curves import draw_curves, read_curves
 from bathyscope_train.data.measured_clips import read_measured_clips
+from bathyscope_train.validation import Example, write_grid
 
 SIZE, FOCAL, CENTRE = (90, 160), 100.0, (76.0, 44.0)
 
@@ -75,3 +77,14 @@ def test_curves_are_told_apart_by_where_they_were_measured(tmp_path: Path) -> No
     picture = cv2.imread(str(tmp_path / "curves.png"))
     assert picture.shape[1] > 1000
     assert picture.std() > 5
+
+
+def test_a_frame_without_truth_is_shown_in_the_range_of_its_own_depth(tmp_path: Path) -> None:
+    ramp = torch.linspace(1, 3, 40).expand(30, 40)
+    examples = [Example("ramp", torch.full((3, 30, 40), 0.5), ramp, true) for true in (2 * ramp, 0 * ramp)]
+    write_grid(tmp_path / "grid.png", examples)
+    picture = cv2.imread(str(tmp_path / "grid.png"))
+    assert picture is not None
+    known, unknown = picture[:, :120], picture[:, 120:]
+    assert (known[:, 40:80] == unknown[:, 40:80]).all()
+    assert (unknown[:, 80:] == unknown[0, 80]).all()  # no truth: one colour

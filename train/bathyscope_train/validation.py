@@ -140,7 +140,10 @@ def focal_ratio(prediction: Prediction, batch: Batch) -> Tensor:
 
 
 def write_grid(path: Path, examples: Sequence[Example]) -> None:
-    """Write a PNG with a row for each example: image, estimated depth, true depth in one colour range."""
+    """Write a PNG with a row for each example: image, estimated depth, true depth in one colour range.
+
+    A frame without truth is shown in the range of its own depth.
+    """
     import cv2
 
     rows = []
@@ -148,8 +151,9 @@ def write_grid(path: Path, examples: Sequence[Example]) -> None:
         true = example.true.numpy()
         valid = true > 0
         depth = example.depth.numpy()
-        depth = depth * (np.median(true[valid]) / np.median(depth[valid]))
-        low, high = np.percentile(true[valid], (2, 98))
+        if valid.any():  # a frame of a reconstruction may hold no point
+            depth = depth * (np.median(true[valid]) / np.median(depth[valid]))
+        low, high = np.percentile(true[valid] if valid.any() else depth, (2, 98))
         image = np.ascontiguousarray((example.image.permute(1, 2, 0).numpy() * 255).astype(np.uint8)[..., ::-1])
         maps = [np.where(keep, _shade(each, low, high), 0) for each, keep in ((depth, True), (true, valid))]
         coloured = [cv2.applyColorMap(each.astype(np.uint8), cv2.COLORMAP_TURBO) for each in maps]

@@ -15,11 +15,13 @@ from bathyscope_train.consistency.rendering import ClipRendering, render_clip
 from bathyscope_train.consistency.settings import ConsistencySettings
 from bathyscope_train.losses.photometric import LEAST_OPACITY
 from bathyscope_train.model.blocks import Block
+from bathyscope_train.model.matching_camera_head import MatchingCameraHead
 from bathyscope_train.model.network import Network
 from bathyscope_train.render import Renderer
 
 TOTAL, VARIATION, GROWTH = "total", "variation", "growth"
 TRUNK = "aggregator"
+DEPTH_CORRECTION = "refiner."
 FLAT = 1e-6
 """Variation of depth within a frame is not taken below this."""
 
@@ -59,7 +61,8 @@ class ClipStep(nn.Module):
     ) -> dict[str, Float[Tensor, ""]]:
         """The terms by name, and with them their weighted sum, the variation of depth and the growth of the scene."""
         geometry, before = self.geometry(images, inside, focal)
-        rendered = render_clip(geometry, self.renderer, self.settings.loss.image)
+        loss = self.settings.loss
+        rendered = render_clip(geometry, self.renderer, loss.image, depth=loss.depth)
         terms = consistency_terms(
             rendered, geometry, before, images=images, inside=inside, settings=self.settings.loss, progress=progress
         )
@@ -78,7 +81,7 @@ class ClipStep(nn.Module):
         with torch.no_grad():
             own = encode(self.before, images, trained=False, autocast=self.autocast) if self.trunk_trained else features
             before, solved = predict_before(self.before, own, images, focal)
-        frozen = not any(value.requires_grad for value in self.network.camera_head.parameters())
+        frozen = not solver_trained(self.network)
         geometry = predict(
             self.network,
             features,
@@ -125,10 +128,27 @@ def check_objective(network: Network, settings: ConsistencySettings) -> None:
             f"the network {name!r} fuses the Gaussians of all frames into voxels, which belong to no frame that could "
             "be left out; set loss.image.views=all"
         )
+    if settings.loss.matches.weight > 0 and (
+        settings.cameras != "given" or not isinstance(network.camera_head, MatchingCameraHead)
+    ):
+        raise SettingsError(
+            f"loss.matches compares with the matches of a camera head that is taken as given; the network {name!r} has "
+            f"{'one' if isinstance(network.camera_head, MatchingCameraHead) else 'none'}, cameras is "
+            f"{settings.cameras!r}; set loss.matches.weight=0"
+        )
     if settings.window.patch != preset.patch_size:
         raise SettingsError(
             f"the network {name!r} has patches of {preset.patch_size} pixels, window.patch is {settings.window.patch}"
         )
+
+
+def solver_trained(network: Network) -> bool:
+    """Whether cameras are trained; the correction of depth by parallax, which belongs to their head, does not count."""
+    return any(
+        value.requires_grad
+        for name, value in network.camera_head.named_parameters()
+        if not name.startswith(DEPTH_CORRECTION)
+    )
 
 
 def frozen_copy(network: Network, *, whole: bool) -> Network:

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from bathyscope_train.model.gaussian_parameters import GaussianBatch
-from bathyscope_train.model.matching_camera_head import CameraSolution, MatchingCameraHead
+from bathyscope_train.model.matching_camera_head import CameraSolution, MatchingCameraHead, PlacedMatches
 from bathyscope_train.model.network import DenseMaps, Features, Network, Prediction
 from bathyscope_train.model.pose_encoding import decode_cameras
 from bathyscope_train.model.scene import assemble_scene
@@ -29,6 +29,8 @@ class ClipGeometry:
     intrinsics: Float[Tensor, "b t 3 3"]
     gaussians: GaussianBatch | None
     """None for a network without a Gaussian head."""
+    seen: PlacedMatches | None = None
+    """None for a network that does not match, and where its cameras are not taken as given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,7 @@ def predict(
     else:
         solved = network.cameras(features, maps.depth, focal)
     maps = replace(maps, depth=solved.depth, gaussians=_only_inside(maps.gaussians, inside))
-    return assemble(network, Prediction(solved.pose_encodings, maps), images)
+    return replace(assemble(network, Prediction(solved.pose_encodings, maps), images), seen=solved.seen)
 
 
 @torch.no_grad()
@@ -100,21 +102,19 @@ def predict_before(
 def given_solution(
     network: Network, features: Features, depth: Float[Tensor, "b t h w"], focal: Float[Tensor, "b"] | None
 ) -> CameraSolution:
-    """Cameras and the correction of depth as they are, without gradients of their own.
+    """Cameras as they are for this depth, without gradients of their own.
 
     A head that solves for motion measures it in the depth's own unit. Its translations follow the mean depth of the
     clip, so that depth that grows or shrinks as a whole takes the cameras along and no loss can gain by it. Other heads
     measure translations by themselves, and these stay.
     """
-    with torch.no_grad():
-        solved = network.cameras(features, depth.detach(), focal)
-    correction = solved.depth / depth.detach()
+    solved = network.cameras(features, depth, focal, given=True)
     encodings = solved.pose_encodings
     if isinstance(network.camera_head, MatchingCameraHead):
         mean = depth.mean((1, 2, 3))
         growth = (mean / mean.detach())[None, :, None, None]
         encodings = torch.cat((encodings[..., :3] * growth, encodings[..., 3:]), dim=-1)
-    return CameraSolution(encodings, depth * correction)
+    return CameraSolution(encodings, solved.depth, solved.seen)
 
 
 def dense_maps(

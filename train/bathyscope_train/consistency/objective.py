@@ -1,4 +1,4 @@
-"""The objective L = λ1 L_rgb + λ2 L_3D + λ3 L_temp, and an anchor, on what is rendered."""
+"""The objective L = λ1 L_rgb + λ2 L_3D + λ3 L_temp on what is rendered, and two terms that are not in the paper."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from torch import Tensor
 from bathyscope_train.consistency.geometry import ClipGeometry
 from bathyscope_train.consistency.rendering import ClipRendering
 from bathyscope_train.consistency.terms import ObjectiveSettings, TemporalTerm
+from bathyscope_train.losses.matches import matches_loss
 from bathyscope_train.losses.photometric import photometric_loss
 from bathyscope_train.losses.temporal import moving_edges_loss, temporal_gradient_loss
 from bathyscope_train.losses.valid import photometric_pixels, solid_pixels
@@ -65,6 +66,8 @@ def consistency_terms(
     if settings.temporal.weight > 0 and progress >= settings.temporal.start:
         meets = _meets(before, inside, settings, settings.temporal.stride)
         terms["temporal"] = _temporal(rendered.depth, cameras, solid, settings.temporal, meets)
+    if settings.matches.weight > 0 and geometry.seen is not None:
+        terms["matches"] = matches_loss(geometry.seen, delta=settings.matches.delta)
     if settings.anchor.weight > 0:
         terms["anchor"] = anchor_loss(geometry.depth, before.depth, inside)
     return terms

@@ -46,6 +46,13 @@ class TemporalTerm(BaseModel, frozen=True, extra="forbid"):
     start: float = Field(default=0.0, ge=0, lt=1, description="Share of the run after which it counts.")
 
 
+class MatchesTerm(BaseModel, frozen=True, extra="forbid"):
+    """Points are seen where depth and motion put them; not in the paper, for networks that match."""
+
+    weight: NonNegativeFloat = 0.0
+    delta: PositiveFloat = Field(default=0.5, description="Of the Huber penalty, in cells of 4 pixels.")
+
+
 class AnchorTerm(BaseModel, frozen=True, extra="forbid"):
     """Depth stays near what it was before training; not in the paper."""
 
@@ -58,7 +65,13 @@ class ObjectiveSettings(BaseModel, frozen=True, extra="forbid"):
     image: ImageTerm = ImageTerm()
     world: WorldTerm = WorldTerm()
     temporal: TemporalTerm = TemporalTerm()
+    matches: MatchesTerm = MatchesTerm()
     anchor: AnchorTerm = AnchorTerm()
+    depth: Literal["rendered", "placed"] = Field(
+        default="rendered",
+        description="What L_3D and L_temp compare: depth rendered from the Gaussians of all frames, which one world "
+        "makes agree whether it is right or wrong; or the depth at which each frame placed its own.",
+    )
 
     @property
     def weights(self) -> dict[str, float]:
@@ -67,6 +80,7 @@ class ObjectiveSettings(BaseModel, frozen=True, extra="forbid"):
             "image": self.image.weight,
             "world": self.world.weight,
             "temporal": self.temporal.weight,
+            "matches": self.matches.weight,
             "anchor": self.anchor.weight,
         }
 

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from bathyscope_train.consistency.clip_step import FLAT, GROWTH, TOTAL, VARIATION, within_frame_variation
 from bathyscope_train.consistency.geometry import ClipGeometry
 from bathyscope_train.consistency.objective import consistency_terms, weighted_sum
-from bathyscope_train.consistency.rendering import ClipRendering
+from bathyscope_train.consistency.rendering import ClipRendering, placed_depth
 from bathyscope_train.consistency.settings import ConsistencySettings
 from bathyscope_train.systems.camera_sources import ClipCameras
 from bathyscope_train.systems.vda.training import VdaGeometry
@@ -43,7 +43,7 @@ class VideoStep(nn.Module):
     ) -> dict[str, Float[Tensor, ""]]:
         """The terms by name, and with them their weighted sum, the variation of depth and its growth."""
         geometry, before = self.geometries(images, inside, known)
-        rendered = _as_rendered(geometry)
+        rendered = placed_depth(geometry)
         terms = consistency_terms(
             rendered, geometry, before, images=images, inside=inside, settings=self.settings.loss, progress=progress
         )
@@ -66,13 +66,8 @@ class VideoStep(nn.Module):
     def look(self, images: Tensor, inside: Tensor, known: ClipCameras | None = None) -> ClipRendering:
         """Depth of clips, for pictures."""
         cameras = known if known is not None else self.geometry.borrowed(images)
-        return _as_rendered(self.geometry(images, inside, cameras))
+        return placed_depth(self.geometry(images, inside, cameras))
 
     def weigh(self, weights: Mapping[str, float]) -> None:
         """Replace the factors of the terms."""
         self.weights = dict(weights)
-
-
-def _as_rendered(geometry: ClipGeometry) -> ClipRendering:
-    """The network's own depth where others render one."""
-    return ClipRendering(geometry.depth, torch.ones_like(geometry.depth), None, None)

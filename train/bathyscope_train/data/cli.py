@@ -39,6 +39,24 @@ def check(
     raise typer.Exit(0 if report.complete else 1)
 
 
+@app.command()
+def cut(
+    folder: Annotated[Path, typer.Argument(exists=True, file_okay=False, help="Data set folder with frames/.")],
+    out: Annotated[Path, typer.Argument(help="New folder.")],
+    *,
+    start: Annotated[int, typer.Option(min=0, help="First frame, counted from 0.")] = 0,
+    stop: Annotated[int | None, typer.Option(min=1, help="Frame after the last one.")] = None,
+    frames_only: Annotated[
+        bool, typer.Option("--frames-only", help="Without depth, points and poses, as videos to train on.")
+    ] = False,
+) -> None:
+    """Copy a range of frames, and what belongs to them, to a folder of its own."""
+    from bathyscope_train.data.datasets.cut import cut_folder
+
+    count = cut_folder(folder, out, start=start, stop=stop, frames_only=frames_only)
+    typer.echo(f"{out}: {count} frames")
+
+
 prepare = typer.Typer(add_completion=False, no_args_is_help=True, help="Convert archives to data set folders.")
 app.add_typer(prepare, name="prepare")
 

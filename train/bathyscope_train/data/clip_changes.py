@@ -19,6 +19,13 @@ class ClipChanges(BaseModel, frozen=True, extra="forbid"):
 
     crop: float = Field(default=0.8, gt=0, le=1, description="Smallest side of a random crop, as a share.")
     crop_chance: float = Field(default=0.5, ge=0, le=1)
+    off_centre: float = Field(
+        default=0.0,
+        ge=0,
+        le=1,
+        description="How far a crop may lie from the middle, 1 for anywhere: it moves the principal point, which no "
+        "network here predicts.",
+    )
     mirror_chance: float = Field(
         default=0.5, ge=0, le=1, description="Left and right; and the same for top and bottom."
     )
@@ -57,7 +64,7 @@ def draw_changes(changes: ClipChanges, random: np.random.Generator) -> DrawnChan
     tint = 1 + random.uniform(-changes.tint, changes.tint, 3)
     return DrawnChanges(
         share=float(share) if chance[0] < changes.crop_chance else 1.0,
-        place=(float(down), float(right)),
+        place=(0.5 + changes.off_centre * float(down - 0.5), 0.5 + changes.off_centre * float(right - 0.5)),
         flip=(bool(chance[1] < changes.mirror_chance), bool(chance[2] < changes.mirror_chance)),
         reverse=bool(chance[3] < changes.reverse_chance),
         gamma=float(gamma),

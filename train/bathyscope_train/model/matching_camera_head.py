@@ -7,7 +7,7 @@ caller knows it; parallax corrects the depth (:mod:`.depth_refiner`), and the co
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
@@ -75,6 +75,34 @@ class PairEstimates:
 
 
 @dataclass(frozen=True, slots=True)
+class Found:
+    """Matches and motions of a clip before its depth is corrected."""
+
+    clip: Clip
+    pairs: ClipPairs
+    estimates: PairEstimates
+    focal: Float[Tensor, "b"]
+    """In pixels."""
+    scale: Float[Tensor, "b"]
+    """Mean of the predicted depth."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlacedMatches:
+    """Queries of e pairs of frames where depth and motion put them, and where they were seen."""
+
+    points: Float[Tensor, "e q 3"]
+    """In the source camera, in units of the clip's mean depth."""
+    matches: Float[Tensor, "e q 2"]
+    """Where they were seen in the target frame, in cells from its principal point."""
+    trust: Float[Tensor, "e q 2"]
+    """0 to 1; 0 for pairs that do not exist."""
+    focal: Float[Tensor, "e"]
+    """In cells."""
+    motion: Motion
+
+
+@dataclass(frozen=True, slots=True)
 class CameraSolution:
     """What the head says about a clip."""
 
@@ -82,6 +110,8 @@ class CameraSolution:
     """After each iteration of the head; the matching head gives only the final one."""
     depth: Float[Tensor, "b t h w"]
     """The predicted depth, corrected by parallax."""
+    seen: PlacedMatches | None = None
+    """How well the corrected depth explains the matches; only where cameras are taken as given."""
 
 
 class FocalHead(nn.Module):
@@ -144,6 +174,46 @@ class MatchingCameraHead(nn.Module):
             depth: Predicted depth.
             focal: Known focal length in pixels; where it is 0 (or not given), it is estimated.
         """
+        found = self.search(camera_tokens, tokens, stem_maps, depth, focal)
+        correction = self.correct_depth(found.clip, found.estimates, found.focal, found.pairs)
+        sharper = found.clip.depth * correction.exp()
+        solution = self.resolve(found.clip, found.estimates, found.focal, found.pairs, depth=sharper)
+        encodings = self.encode(found, solution)
+        return CameraSolution(encodings, self.corrected(found.clip, depth, correction))
+
+    def take_as_given(
+        self,
+        camera_tokens: Float[Tensor, "b t c"],
+        tokens: Float[Tensor, "b t n c"],
+        stem_maps: Sequence[Float[Tensor, "b t k gh gw"]],
+        depth: Float[Tensor, "b t h w"],
+        focal: Float[Tensor, "b"] | None = None,
+    ) -> CameraSolution:
+        """The numbers of :meth:`forward`; gradients reach the depth and its correction, and nothing else.
+
+        Matches, focal length and motions are those of the depth as it is. They minimise what is left of the matches,
+        so that to first order they would not answer to a change of the depth anyway.
+        """
+        with torch.no_grad():
+            found = self.search(camera_tokens, tokens, stem_maps, depth, focal)
+        clip = replace(found.clip, depth=query_depth(depth / depth.mean((1, 2, 3))[:, None, None, None]))
+        correction = self.correct_depth(clip, found.estimates, found.focal, found.pairs)
+        sharper = clip.depth * correction.exp()
+        with torch.no_grad():
+            solution = self.resolve(clip, found.estimates, found.focal, found.pairs, depth=sharper)
+            encodings = self.encode(found, solution)
+        seen = _placed_matches(replace(found, clip=clip), sharper, solution)
+        return CameraSolution(encodings, self.corrected(clip, depth, correction), seen)
+
+    def search(
+        self,
+        camera_tokens: Float[Tensor, "b t c"],
+        tokens: Float[Tensor, "b t n c"],
+        stem_maps: Sequence[Float[Tensor, "b t k gh gw"]],
+        depth: Float[Tensor, "b t h w"],
+        focal: Float[Tensor, "b"] | None = None,
+    ) -> Found:
+        """Matches, motions and the focal length that suits them, with the depth as it was predicted."""
         t, height, width = depth.shape[1:]
         scale = depth.mean((1, 2, 3))
         clip = self.describe(tokens, stem_maps, depth / scale[:, None, None, None])
@@ -153,17 +223,18 @@ class MatchingCameraHead(nn.Module):
         first = torch.where(known > 0, known, first)
         estimates = self.estimate(clip, first, pairs, between=follow_steps)
         refined = self.refine_focal(clip, estimates, first, pairs)
-        refined = torch.where(known > 0, known, refined)
-        correction = self.correct_depth(clip, estimates, refined, pairs)
-        solution = self.resolve(clip, estimates, refined, pairs, depth=clip.depth * correction.exp())
-        trajectory = _trajectory(solution, pairs, self.settings.settling)
-        fields = [2 * torch.atan(0.5 * side / refined) for side in (height, width)]
+        return Found(clip, pairs, estimates, torch.where(known > 0, known, refined), scale)
+
+    def encode(self, found: Found, solution: Solution) -> Float[Tensor, "1 b t 9"]:
+        """Pose encodings of the trajectory that fits the motions of all pairs."""
+        trajectory = _trajectory(solution, found.pairs, self.settings.settling)
+        fields = [2 * torch.atan(0.5 * side / found.focal) for side in found.clip.size]
         encoding = [
-            trajectory.translation * scale[:, None, None],
+            trajectory.translation * found.scale[:, None, None],
             matrix_to_quaternion(trajectory.rotation),
             torch.stack(fields, -1)[:, None].expand(*trajectory.translation.shape[:2], 2),
         ]
-        return CameraSolution(torch.cat(encoding, -1)[None], self.corrected(clip, depth, correction))
+        return torch.cat(encoding, -1)[None]
 
     def describe(
         self,
@@ -306,6 +377,15 @@ def image_diagonal(height: int, width: int, *, like: Tensor) -> Float[Tensor, ""
     """Length of the diagonal in pixels."""
     sides = [torch.full((), side, device=like.device, dtype=like.dtype) for side in (height, width)]
     return (sides[0].square() + sides[1].square()).sqrt()
+
+
+def _placed_matches(found: Found, depth: Float[Tensor, "b t q"], solution: Solution) -> PlacedMatches:
+    """Gradients reach the points only."""
+    pairs, last = found.pairs, found.estimates.last
+    cells = _per_pair(found.focal / CELL, pairs)
+    there = pairs.inside.to(depth.dtype).expand(found.focal.shape[0], -1).flatten()
+    points = _points(found.clip, depth[:, pairs.source].flatten(0, 1), cells)
+    return PlacedMatches(points, last.matches, last.trust * there[:, None, None], cells, solution.motion)
 
 
 def _trajectory(solution: Solution, pairs: ClipPairs, settling: int) -> Motion:

@@ -132,16 +132,30 @@ class Network(nn.Module):
         return raw
 
     def cameras(
-        self, features: Features, depth: Float[Tensor, "b t h w"], focal: Float[Tensor, "b"] | None = None
+        self,
+        features: Features,
+        depth: Float[Tensor, "b t h w"],
+        focal: Float[Tensor, "b"] | None = None,
+        *,
+        given: bool = False,
     ) -> CameraSolution:
-        """Pose encodings after each iteration, and the depth as corrected by the motion between the frames."""
+        """Pose encodings after each iteration, and the depth as corrected by the motion between the frames.
+
+        Args:
+            features: Of the clips.
+            depth: Of the depth head.
+            focal: Focal length in pixels where it is known, 0 where not.
+            given: Take cameras as given: gradients reach the depth and its correction only.
+        """
         with _float32(features.camera.device):
             camera = features.camera.float()
             if isinstance(self.camera_head, MatchingCameraHead):
                 maps = [each.float() for each in features.stem_maps]
-                solved: CameraSolution = self.camera_head(camera, features.taps[-1].float(), maps, depth.float(), focal)
+                head = self.camera_head.take_as_given if given else self.camera_head
+                solved: CameraSolution = head(camera, features.taps[-1].float(), maps, depth.float(), focal)
                 return solved
-            return CameraSolution(self.camera_head(camera), depth)
+            encodings = self.camera_head(camera)
+            return CameraSolution(encodings.detach() if given else encodings, depth)
 
     def forward(self, images: Float[Tensor, "b t 3 h w"], focal: Float[Tensor, "b"] | None = None) -> Prediction:
         """Predict everything for clips of images in [0, 1]; sides are multiples of the patch size.
