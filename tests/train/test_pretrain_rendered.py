@@ -23,7 +23,8 @@ from bathyscope_train.devices import choose_device, use_bfloat16
 from bathyscope_train.losses.supervised import supervised_objective
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import get_preset
-from bathyscope_train.pretrain import METRICS_FILE, draw_pairs, pretrain, training_record
+from bathyscope_train.pretrain import METRICS_FILE, draw_pairs, pretrain
+from bathyscope_train.pretrain_record import training_record
 from bathyscope_train.training_state import STATE_FILE
 
 CPU = torch.device("cpu")

@@ -27,7 +27,8 @@ from bathyscope_train.model.presets import (
     NetworkPreset,
     VitSettings,
 )
-from bathyscope_train.pretrain import METRICS_FILE, WEIGHTS_FILE, draw_pairs, pretrain, training_record
+from bathyscope_train.pretrain import METRICS_FILE, WEIGHTS_FILE, draw_pairs, pretrain
+from bathyscope_train.pretrain_record import training_record
 from bathyscope_train.schedule import ema_decay, learning_rate_factor, source_shares
 from bathyscope_train.training_state import STATE_FILE
 from bathyscope_train.validation import validate
@@ -117,6 +118,9 @@ def test_the_weights_say_how_they_were_made_but_not_on_whose_machine(clips: Path
 def test_a_run_can_start_from_the_weights_of_another(clips: Path, tmp_path: Path) -> None:
     first = pretrain(settings(clips, tmp_path / "first"))
     path = pretrain(settings(clips, tmp_path / "second", initial=first, steps=1, peak_lr=1e-9, seed=9))
+    made = training_of(path)
+    assert made["began_with"] == training_of(first)
+    assert made["clips"] == {"train": "12 clips, seeds 0 to 11"}
     before, after = load_file(first), load_file(path)
     assert max(float((before[name] - after[name]).abs().max()) for name in before) < 1e-6
 

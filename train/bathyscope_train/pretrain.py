@@ -25,6 +25,7 @@ from bathyscope_train.model.matching_camera_head import MatchingCameraHead
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import get_preset
 from bathyscope_train.model.trajectory import ClipPairs, clip_pairs
+from bathyscope_train.pretrain_record import making_of
 from bathyscope_train.schedule import ema_decay, learning_rate_factor
 from bathyscope_train.training_state import read_state, write_state
 from bathyscope_train.validation import Validation, validate, write_grid
@@ -77,6 +78,7 @@ class _Run:
             settings.data, settings.render, device=self.device, seed=settings.seed, step=self.position.step
         )
         self.held_out = [held_out_clips(path, settings.validation_clips) for path in settings.validation]
+        self.making = making_of(settings)
         self.started = time.monotonic() - self.position.elapsed_s
         self.recent: list[Tensor] = []
 
@@ -177,7 +179,7 @@ class _Run:
     def save(self) -> None:
         """Write weights and state."""
         self.position.elapsed_s = time.monotonic() - self.started
-        training = {"step": self.position.step, "settings": training_record(self.settings)}
+        training = {"step": self.position.step, **self.making}
         save_checkpoint(self.averaged(), self.settings.out / WEIGHTS_FILE, training=training)
         write_state(self.settings.out, self.network, self.average, self.optimizer, self.position)
 
@@ -208,17 +210,6 @@ def held_out_clips(folder: Path, count: int) -> list[TruthClip]:
     if (folder / "frames").is_dir():
         return read_measured_clips(folder, limit=count)
     return read_truth_clips(folder, limit=count)
-
-
-def training_record(settings: PretrainSettings) -> dict[str, Any]:
-    """What a checkpoint says about its making: the settings, with the names of folders but not where they lay."""
-    record: dict[str, Any] = json.loads(settings.model_dump_json(exclude={"out"}))
-    for source in record["data"]:
-        for kind in ("folder", "domain"):
-            source[kind] = Path(source[kind]).name if source[kind] else None
-    record["validation"] = [Path(folder).name for folder in record["validation"]]
-    record["initial"] = Path(record["initial"]).name if record["initial"] else None
-    return record
 
 
 def choose_parameters(network: Network, prefix: str) -> list[nn.Parameter]:
