@@ -63,7 +63,7 @@ def test_frames_only_leaves_out_what_training_must_not_see(folder: Path, tmp_pat
 
 
 def test_a_range_without_frames_and_a_folder_that_exists_are_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="has 6 frames in frames/, none from 6 to the end"):
+    with pytest.raises(DatasetError, match="has 6 frames in frames/, none from 6 to the end; give a range inside it"):
         cut_folder(folder, tmp_path / "none", start=6)
     with pytest.raises(DatasetError, match="whole: exists"):
         cut_folder(folder, folder)

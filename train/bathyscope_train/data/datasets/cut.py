@@ -36,7 +36,9 @@ def cut_folder(folder: Path, out: Path, *, start: int = 0, stop: int | None = No
     chosen = files[start:stop]
     if not chosen:
         end = "the end" if stop is None else stop
-        raise DatasetError(f"{folder}: has {len(files)} frames in frames/, none from {start} to {end}")
+        raise DatasetError(
+            f"{folder}: has {len(files)} frames in frames/, none from {start} to {end}; give a range inside it"
+        )
     if out.exists():
         raise DatasetError(f"{out}: exists; name a folder that does not, or remove it")
     partial = out.with_name(f".{out.name}.partial")
