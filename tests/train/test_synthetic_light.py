@@ -1,6 +1,7 @@
 """Light and material of the rendered world against closed forms, what lies on tissue, and the held-out domain."""
 
 from math import log
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -170,3 +171,21 @@ def test_the_held_out_domain_lies_outside_what_training_sees() -> None:
         ]
         assert any(apart)
     assert broad.spots[1] <= shifted.spots[0]
+
+
+def test_the_typical_domain_lies_within_the_broad_one() -> None:
+    def ranges(values: dict[str, Any], prefix: str = "") -> dict[str, tuple[float, float]]:
+        found: dict[str, tuple[float, float]] = {}
+        for name, value in values.items():
+            if isinstance(value, dict):
+                found |= ranges(value, f"{prefix}{name}.")
+            elif isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], float):
+                found[prefix + name] = value
+        return found
+
+    typical, broad = ranges(DOMAINS["typical"].model_dump()), ranges(DOMAINS["broad"].model_dump())
+    assert len(typical) > 50
+    outside = [name for name, (low, high) in typical.items() if low < broad[name][0] or high > broad[name][1]]
+    assert outside == ["camera.slow_speed"]  # that of the broad domain is slower as a whole
+    assert set(DOMAINS["typical"].material.palettes) <= set(DOMAINS["broad"].material.palettes)
+    assert set(DOMAINS["typical"].families) == set(DOMAINS["broad"].families)

@@ -58,6 +58,10 @@ class PretrainSettings(BaseModel, frozen=True, extra="forbid"):
     initial: CheckpointPath | None = Field(
         default=None, description="Checkpoint (safetensors) to start from; `shipped` for the one in the package."
     )
+    encoder: Path | None = Field(
+        default=None, description="Published EfficientNet-Lite0 weights, for a fresh network with that encoder."
+    )
+    encoder_rate: PositiveFloat = Field(default=0.1, description="Learning rate of that encoder over that of the rest.")
     only: str = Field(default="", description="Train only parameters whose names start so, as gaussian_param_head.")
     minutes: PositiveFloat = Field(default=30.0, description="Wall-clock budget; the learning rate follows it.")
     steps: PositiveInt | None = Field(default=None, description="Budget in steps instead: the same bits for a seed.")
@@ -99,6 +103,8 @@ class PretrainSettings(BaseModel, frozen=True, extra="forbid"):
             raise ValueError("a run of several workers cannot be cut into slices by time; use steps, or one worker")
         if self.device == "cuda" and self.workers > 1:
             raise ValueError(f"on cuda one worker trains, got {self.workers}")
+        if self.encoder is not None and self.initial is not None:
+            raise ValueError("encoder is for a fresh network; initial brings an encoder of its own")
         if self.frames <= 4:
             raise ValueError(f"windows need more than 4 frames for their widest pairs, got {self.frames}")
         return self

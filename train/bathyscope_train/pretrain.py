@@ -21,9 +21,11 @@ from bathyscope_train.data.windows import TruthClip
 from bathyscope_train.devices import choose_device, use_bfloat16
 from bathyscope_train.losses.supervised import SolverInput, supervised_objective
 from bathyscope_train.model.checkpoints import load_network, save_checkpoint
+from bathyscope_train.model.lite0 import Lite0Encoder
 from bathyscope_train.model.matching_camera_head import MatchingCameraHead
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import get_preset
+from bathyscope_train.model.stem import EncodedStem
 from bathyscope_train.model.trajectory import ClipPairs, clip_pairs
 from bathyscope_train.pretrain_record import making_of
 from bathyscope_train.schedule import ema_decay, learning_rate_factor
@@ -34,6 +36,9 @@ from bathyscope_train.workers import average, launch, share_gradients
 LOG_STEPS = 10
 WEIGHTS_FILE = "model.safetensors"
 METRICS_FILE = "metrics.jsonl"
+
+ENCODER = "aggregator.patch_embed.encoder."
+"""What names of parameters of a pre-trained encoder begin with."""
 
 _FOCAL_ERROR = 0.15  # standard deviation of the logarithm
 _HINT_ERROR = 0.3
@@ -131,7 +136,7 @@ class _Run:
         norm = torch.nn.utils.clip_grad_norm_(self.parameters, settings.clip_norm)
         factor = learning_rate_factor(step, progress, warmup_steps=settings.warmup_steps)
         for group in self.optimizer.param_groups:
-            group["lr"] = settings.peak_lr * factor
+            group["lr"] = settings.peak_lr * factor * group["share"]
         if bool(norm.isfinite()):
             self.optimizer.step()
         else:
@@ -198,11 +203,20 @@ def initial_network(settings: PretrainSettings) -> Network:
     """
     torch.manual_seed(settings.seed)
     network = load_network(settings.initial)[0] if settings.initial else Network(get_preset(settings.preset))
+    if settings.encoder is not None:
+        _encoder(network).load_published(settings.encoder)
     if not isinstance(network.camera_head, MatchingCameraHead):
         raise SettingsError(
             f"preset {network.preset.name!r} has no matching camera head; pre-training needs one, as in 'tiny'"
         )
     return network
+
+
+def _encoder(network: Network) -> Lite0Encoder:
+    stem = network.aggregator.patch_embed
+    if not isinstance(stem, EncodedStem):
+        raise SettingsError(f"preset {network.preset.name!r} has no encoder; give preset=tiny-lite0, or no encoder")
+    return stem.encoder
 
 
 def held_out_clips(folder: Path, count: int) -> list[TruthClip]:
@@ -227,13 +241,20 @@ def choose_parameters(network: Network, prefix: str) -> list[nn.Parameter]:
 
 
 def parameter_groups(network: Network, settings: PretrainSettings) -> list[dict[str, Any]]:
-    """Weight decay for matrices and kernels; none for biases, norms and tokens."""
-    trained = [(name, p) for name, p in network.named_parameters() if p.requires_grad]
-    decayed = [p for name, p in trained if p.ndim >= 2 and "token" not in name]
-    others = [p for name, p in trained if p.ndim < 2 or "token" in name]
+    """Weight decay for matrices and kernels, none for biases, norms and tokens; a pre-trained encoder learns slower."""
+    groups: dict[tuple[bool, bool], list[nn.Parameter]] = {}
+    for name, parameter in network.named_parameters():
+        if parameter.requires_grad:
+            decayed = parameter.ndim >= 2 and "token" not in name
+            groups.setdefault((name.startswith(ENCODER), not decayed), []).append(parameter)
     return [
-        {"params": decayed, "weight_decay": settings.weight_decay, "lr": settings.peak_lr},
-        {"params": others, "weight_decay": 0.0, "lr": settings.peak_lr},
+        {
+            "params": parameters,
+            "weight_decay": 0.0 if plain else settings.weight_decay,
+            "share": settings.encoder_rate if encoder else 1.0,
+            "lr": settings.peak_lr,
+        }
+        for (encoder, plain), parameters in sorted(groups.items(), key=lambda item: item[0])
     ]
 
 

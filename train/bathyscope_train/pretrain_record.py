@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from pathlib import Path
 from typing import Any
@@ -18,13 +19,16 @@ def training_record(settings: PretrainSettings) -> dict[str, Any]:
         for kind in ("folder", "domain"):
             source[kind] = Path(source[kind]).name if source[kind] else None
     record["validation"] = [Path(folder).name for folder in record["validation"]]
-    record["initial"] = Path(record["initial"]).name if record["initial"] else None
+    for file in ("initial", "encoder"):
+        record[file] = Path(record[file]).name if record[file] else None
     return record
 
 
 def making_of(settings: PretrainSettings) -> dict[str, Any]:
-    """What stays the same while it trains: the settings, the rendered clips, and the making of the initial weights."""
-    found = {"settings": training_record(settings), "clips": _clips(settings)}
+    """What stays the same while it trains: settings, clips, digest of the encoder, how initial weights were made."""
+    found: dict[str, Any] = {"settings": training_record(settings), "clips": _clips(settings)}
+    if settings.encoder is not None:
+        found["encoder_sha256"] = hashlib.sha256(settings.encoder.read_bytes()).hexdigest()
     before = training_of(settings.initial) if settings.initial is not None else {}
     return {**found, "began_with": before} if before else found
 

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from bathyscope_train.model.blocks import Block
 from bathyscope_train.model.presets import ConvStemSettings, NetworkPreset
 from bathyscope_train.model.rope import grid_positions, rope_tables
-from bathyscope_train.model.stem import ConvStem
+from bathyscope_train.model.stem import ConvStem, EncodedStem
 from bathyscope_train.model.vit import VisionTransformer
 
 _MEAN = (0.485, 0.456, 0.406)
@@ -91,7 +91,8 @@ def build_stem(preset: NetworkPreset) -> nn.Module:
     """
     stem, settings = preset.stem, preset.aggregator
     if isinstance(stem, ConvStemSettings):
-        return ConvStem(settings.width, channels=stem.channels, patch_size=preset.patch_size)
+        kind = ConvStem if stem.encoder is None else EncodedStem
+        return kind(settings.width, channels=stem.channels, patch_size=preset.patch_size)
     return VisionTransformer(
         width=settings.width,
         depth=stem.depth,

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from bathyscope_train.model.presets import LightHeadSettings
-from bathyscope_train.model.stem import ResidualConv
+from bathyscope_train.model.stem import ResidualConv, resize
 from bathyscope_train.model.view_embedding import add_view_embedding
 
 
@@ -71,9 +71,9 @@ class LightDenseHead(nn.Module):
             [project(norm(tap)) for tap, norm, project in zip(taps, self.norms, self.projects, strict=True)]
         ).sum(0)
         maps = add_view_embedding(tokens.transpose(1, 2).unflatten(2, grid), size)
-        maps = _resize(self.refine_tokens(maps), _size(quarter)) + self.quarter_skip(quarter)
-        maps = _resize(self.narrow(F.relu(self.refine_quarter(maps))), _size(half)) + self.half_skip(half)
-        maps = _resize(self.to_full(F.relu(self.refine_half(maps))), size)
+        maps = resize(self.refine_tokens(maps), _size(quarter)) + self.quarter_skip(quarter)
+        maps = resize(self.narrow(F.relu(self.refine_quarter(maps))), _size(half)) + self.half_skip(half)
+        maps = resize(self.to_full(F.relu(self.refine_half(maps))), size)
         maps = torch.cat([maps, images] if extra is None else [maps, images, extra], 1)
         raw: Tensor = self.readout(F.relu(self.full(maps)))
         return raw
@@ -118,10 +118,6 @@ class LightGaussianHead(LightDenseHead):
         logarithm = depth.detach().log()
         centred = logarithm - logarithm.mean((-2, -1), keepdim=True)
         return self.forward(taps, images, stem_maps, extra=4 * centred[:, None])
-
-
-def _resize(maps: Float[Tensor, "n c h w"], size: tuple[int, int]) -> Float[Tensor, "n c h2 w2"]:
-    return F.interpolate(maps, size=size, mode="bilinear", align_corners=False)
 
 
 def _size(maps: Tensor) -> tuple[int, int]:

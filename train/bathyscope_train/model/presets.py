@@ -33,6 +33,9 @@ class ConvStemSettings(BaseModel, frozen=True, extra="forbid"):
     channels: PositiveInt = Field(
         default=32, description="Of the half-size map; the quarter-size map has twice as many."
     )
+    encoder: Literal["lite0"] | None = Field(
+        default=None, description="Pre-trained encoder whose features are added: EfficientNet-Lite0."
+    )
 
 
 class AggregatorSettings(BaseModel, frozen=True, extra="forbid"):
@@ -152,6 +155,8 @@ _TINY = NetworkPreset(
     harmonic_degree=0,
 )
 
+_TINY_LITE0 = _TINY.model_copy(update={"name": "tiny-lite0", "stem": ConvStemSettings(encoder="lite0")})
+
 _SMALL = NetworkPreset(
     name="small",
     stem=ConvStemSettings(channels=48),
@@ -165,6 +170,7 @@ _SMALL = NetworkPreset(
 PRESETS = MappingProxyType(
     {
         "tiny": _TINY,
+        "tiny-lite0": _TINY_LITE0,
         "small": _SMALL,
         "anysplat": NetworkPreset(name="anysplat", scene=_ANYSPLAT_SCENE),
         "vggt": NetworkPreset(

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from bathyscope_train.model.lite0 import CHANNELS, Lite0Encoder
 from bathyscope_train.model.view_embedding import add_view_embedding
 
 CELL = 4
@@ -28,7 +29,7 @@ class ResidualConv(nn.Module):
 
 
 class ConvStem(nn.Module):
-    """Tokens of 14-pixel patches from a pyramid of convolutions at 1/2 and 1/4 of the image.
+    """Tokens of patches from a pyramid of convolutions at 1/2 and 1/4 of the image.
 
     Args:
         width: Channels of a token.
@@ -52,5 +53,46 @@ class ConvStem(nn.Module):
         """Patch tokens, row by row, and the maps (n, k, h/2, w/2) and (n, 2 k, h/4, w/4), both rounded up."""
         half = self.to_half(images)
         quarter = self.to_quarter(half)
-        tokens = add_view_embedding(self.proj(F.relu(half)), (images.shape[-2], images.shape[-1]))
-        return tokens.flatten(2).transpose(1, 2), (half, quarter)
+        return _as_tokens(self.proj(F.relu(half)), images), (half, quarter)
+
+
+class EncodedStem(ConvStem):
+    """The convolutional stem, to whose maps and tokens the features of a pre-trained encoder are added.
+
+    Half- and quarter-size maps gain what the encoder has at their size; tokens gain its maps at 1/8 and 1/16, resampled
+    to the grid of the patches.
+
+    Args:
+        width: Channels of a token.
+        channels: Channels of the half-size map.
+        patch_size: Side of a patch; even.
+    """
+
+    def __init__(self, width: int, *, channels: int = 32, patch_size: int = 14) -> None:
+        super().__init__(width, channels=channels, patch_size=patch_size)
+        half, quarter, *coarse = CHANNELS
+        self.encoder = Lite0Encoder()
+        self.add_half = nn.Conv2d(half, channels, 1)
+        self.add_quarter = nn.Conv2d(quarter, 2 * channels, 1)
+        self.add_tokens = nn.ModuleList(nn.Conv2d(count, width, 1) for count in coarse)
+
+    def forward(self, images: Float[Tensor, "n 3 h w"]) -> tuple[Float[Tensor, "n hw c"], tuple[Tensor, Tensor]]:
+        """As the plain stem's."""
+        encoded = self.encoder(images)
+        half = self.to_half(images) + self.add_half(encoded[0])
+        quarter = self.to_quarter(half) + self.add_quarter(encoded[1])
+        tokens = self.proj(F.relu(half))
+        for add, maps in zip(self.add_tokens, encoded[2:], strict=True):
+            tokens = tokens + resize(add(maps), (tokens.shape[-2], tokens.shape[-1]))
+        return _as_tokens(tokens, images), (half, quarter)
+
+
+def resize(maps: Float[Tensor, "n c h w"], size: tuple[int, int]) -> Float[Tensor, "n c h2 w2"]:
+    """Bilinear, corners of the outer pixels aligned."""
+    return F.interpolate(maps, size=size, mode="bilinear", align_corners=False)
+
+
+def _as_tokens(maps: Float[Tensor, "n c h w"], images: Float[Tensor, "n 3 h2 w2"]) -> Float[Tensor, "n hw c"]:
+    """Row by row, each with where it looks."""
+    placed = add_view_embedding(maps, (images.shape[-2], images.shape[-1]))
+    return placed.flatten(2).transpose(1, 2)

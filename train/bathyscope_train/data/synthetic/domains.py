@@ -4,7 +4,8 @@ Each is a file beside this module, in the format of ``Domain.from_file``:
 
 * ``source``: narrow; pink mucosa, inverse-square light, little noise. A small model learns it within minutes. It is
   what the ranges default to.
-* ``broad``: wide ranges of everything; what a model should have seen before it meets a real endoscope.
+* ``typical``: moderate ranges of everything: what most endoscopes and tissues look like.
+* ``broad``: wide ranges of everything, the far ends included: narrow and fish-eye views, strong haze, paint and smear.
 * ``shifted``: never trained on; pale and yellowish, spotted, slow fall-off, narrow beam, strong highlights.
 """
 
@@ -15,7 +16,7 @@ from pathlib import Path
 from bathyscope_train.data.synthetic.domain import Domain
 
 _FOLDER = Path(__file__).with_name("domains")
-_NAMES = ("source", "broad", "shifted")
+_NAMES = ("source", "typical", "broad", "shifted")
 
 
 class NamedDomains(Mapping[str, Domain]):
