@@ -60,6 +60,51 @@ def test_noisy_matches_carry_less_information() -> None:
     assert bool(((ratio > 25) & (ratio < 100)).all())
 
 
+def test_a_held_back_motion_is_the_ridge_regression_of_its_flow() -> None:
+    points, true = two_scenes()
+    points = points.double()
+    focal, tiny = FOCAL_CELLS.double(), 1e-4
+    angles, translation = tiny * rotation_logarithm(true.rotation.double()), tiny * true.translation.double()
+    target = project(points, Motion(rotation_exponential(angles), translation), focal)
+    flow = target - focal[:, None, None] * points[..., :2] / points[..., 2:]
+    noise = 0.3 * float(flow.square().mean())  # the smallest flow, 1e-4 cells^2, is far above the flow itself
+    found = solve_motion(
+        points, target, torch.ones_like(target), focal, Motion.none(points[:, 0]), iterations=30, flow_noise=noise
+    )
+    x, y, z = points.unbind(-1)
+    zero = torch.zeros_like(x)
+    across = torch.stack([1 / z, zero, -x / z**2, -x * y / z**2, 1 + (x / z) ** 2, -y / z], -1)
+    down = torch.stack([zero, 1 / z, -y / z**2, -1 - (y / z) ** 2, x * y / z**2, x / z], -1)
+    jacobian = focal[:, None, None, None] * torch.stack([across, down], 2)
+    for pair in range(2):
+        design, seen = jacobian[pair].flatten(0, 1), flow[pair].flatten()
+        hold = noise / (float(flow[pair].square().mean()) + 1e-4)
+        normal = design.T @ design
+        expected = torch.linalg.solve(normal + hold * torch.diag(normal.diagonal()), design.T @ seen)
+        observed = torch.cat([found.motion.translation[pair], rotation_logarithm(found.motion.rotation[pair])])
+        torch.testing.assert_close(observed, expected, rtol=2e-2, atol=1e-9)
+
+
+def test_noise_turns_a_still_camera_that_is_held_back_less_and_a_moving_one_as_before() -> None:
+    random = torch.Generator().manual_seed(5)
+    plane = torch.rand(1, 250, 2, generator=random) * 0.7 - 0.35
+    wall = torch.cat([plane, torch.ones(1, 250, 1)], -1) * (1 + 0.04 * torch.rand(1, 250, 1, generator=random))
+    points, focal = wall.expand(20, -1, -1), torch.full((20,), 40.0)
+    noise = 0.2 * torch.randn(20, 250, 2, generator=random)
+
+    def turned(shift: float, flow_noise: float) -> float:
+        true = Motion(torch.eye(3).expand(20, 3, 3), shift * torch.tensor([0.04, -0.02, 0.01]).expand(20, 3))
+        seen = project(points, true, focal) + noise
+        start = Motion.none(points[:, 0])
+        found = solve_motion(points, seen, torch.ones_like(seen), focal, start, iterations=8, flow_noise=flow_noise)
+        return float(rotation_logarithm(found.motion.rotation).norm(dim=-1).mean())
+
+    assert turned(0.0, 0.001) < 0.3 * turned(0.0, 0.0)
+    assert turned(0.1, 0.001) < 0.5 * turned(0.1, 0.0)
+    assert turned(1.0, 0.001) < 1.15 * turned(1.0, 0.0)
+    assert turned(3.0, 0.001) < 1.05 * turned(3.0, 0.0)
+
+
 def test_the_solver_passes_a_correct_gradient_to_matches_and_weights() -> None:
     points, true = two_scenes(12)
     points, focal = points.double(), FOCAL_CELLS.double()

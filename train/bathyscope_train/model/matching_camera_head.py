@@ -287,7 +287,15 @@ class MatchingCameraHead(nn.Module):
                 base = torch.minimum(torch.maximum(project(points, motion, cells), low), high) + principal
             matches, trust = self.matcher.correct(correlation, base.detach(), context, distance.log(), position)
             matches = matches - principal
-            solution = solve_motion(points, matches, trust, cells, motion, iterations=self.settings.iterations)
+            solution = solve_motion(
+                points,
+                matches,
+                trust,
+                cells,
+                motion,
+                iterations=self.settings.iterations,
+                flow_noise=self.settings.flow_noise,
+            )
             motion = solution.motion
             rounds.append(Round(matches, trust, solution))
         return PairEstimates(correlation, tuple(rounds))
@@ -328,7 +336,15 @@ class MatchingCameraHead(nn.Module):
         points = _points(clip, depth[:, pairs.source].flatten(0, 1), cells)
         last = estimates.last
         start = last.solution.motion.detach()
-        return solve_motion(points, last.matches, last.trust, cells, start, iterations=self.settings.final_iterations)
+        return solve_motion(
+            points,
+            last.matches,
+            last.trust,
+            cells,
+            start,
+            iterations=self.settings.final_iterations,
+            flow_noise=self.settings.flow_noise,
+        )
 
     def correct_depth(
         self,

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bathyscope_train.model.rigid import cross_matrix, rotate, rotation_exponential
+from bathyscope_train.model.rigid import cross_matrix, rotate, rotation_exponential, rotation_logarithm
 
 NEAREST = 0.05
 """Smallest depth behind which a projection is cut off, in units of the clip's mean depth."""
@@ -23,6 +23,8 @@ NOISE_FLOOR = 0.02
 _RELATIVE_DAMPING = 1e-3
 _ABSOLUTE_DAMPING = 1e-2
 _LARGEST_UPDATE = 1.0
+_SMALLEST_FLOW = 1e-4  # cells^2
+_LARGEST_HOLD = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +82,13 @@ def solve_motion(
     start: Motion,
     *,
     iterations: int = 3,
+    flow_noise: float = 0.0,
 ) -> Solution:
     """Weighted least-squares motion of each pair, by unrolled Gauss-Newton.
+
+    Turning and moving sideways look alike where there is little relief, and on slow video the noise of the matches
+    decides between them: large parts that cancel in the picture. ``flow_noise`` holds every part of a motion back by as
+    much as its own flow would exceed what was seen: nothing where much moves, noticeably where hardly anything does.
 
     Args:
         points: Points in the source camera; depth about 1 (clip mean).
@@ -90,15 +97,41 @@ def solve_motion(
         focal: Focal length in cells.
         start: First guess.
         iterations: How often the system is linearised and solved.
+        flow_noise: Variance, in cells^2, against the mean squared flow of a pair; 0 holds nothing back.
     """
     motion = start
+    hold = None if flow_noise == 0 else flow_noise / _mean_squared_flow(points, target, weights, focal)
     for _ in range(iterations):
         matrix, vector, _ = _normal_equations(points, target, weights, focal, motion)
+        if hold is not None:
+            matrix, vector = _held_back(matrix, vector, motion, hold)
         update = solve_positive(damped(matrix), vector).clamp(-_LARGEST_UPDATE, _LARGEST_UPDATE)
         turn = rotation_exponential(update[..., 3:])
         motion = Motion(turn @ motion.rotation, rotate(turn, motion.translation) + update[..., :3])
     matrix, _, variance = _normal_equations(points, target, weights, focal, motion)
     return Solution(motion, matrix / (variance + NOISE_FLOOR)[:, None, None], variance)
+
+
+def _mean_squared_flow(
+    points: Float[Tensor, "e n 3"],
+    target: Float[Tensor, "e n 2"],
+    weights: Float[Tensor, "e n 2"],
+    focal: Float[Tensor, "e"],
+) -> Float[Tensor, "e"]:
+    """Weighted mean squared distance of the matches from where their points were, cells^2; without a gradient."""
+    flow = target - focal[:, None, None] * points[..., :2] / points[..., 2:]
+    mean = (weights * flow.square()).sum((-2, -1)) / (weights.sum((-2, -1)) + 1e-6)
+    return (mean + _SMALLEST_FLOW).detach()
+
+
+def _held_back(
+    matrix: Float[Tensor, "e 6 6"], vector: Float[Tensor, "e 6"], motion: Motion, hold: Float[Tensor, "e"]
+) -> tuple[Float[Tensor, "e 6 6"], Float[Tensor, "e 6"]]:
+    """Normal equations with a prior for no motion, whose precision is a share of the matrix's own diagonal."""
+    identity = torch.eye(6, dtype=matrix.dtype, device=matrix.device)
+    prior = (matrix * identity).sum(-1) * hold.clamp_max(_LARGEST_HOLD)[:, None]
+    so_far = torch.cat([motion.translation, rotation_logarithm(motion.rotation)], -1)
+    return matrix + prior[..., None] * identity, vector - prior * so_far
 
 
 @dataclass(frozen=True, slots=True)

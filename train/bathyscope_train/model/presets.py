@@ -7,7 +7,7 @@ comes in several kinds has a ``kind`` field; the factories beside the parts read
 from types import MappingProxyType
 from typing import Annotated, Literal, Self
 
-from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import BaseModel, Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from bathyscope.errors import SettingsError
 
@@ -77,6 +77,9 @@ class MatchingCameraSettings(BaseModel, frozen=True, extra="forbid"):
     iterations: Repeats = Field(default=3, description="Solver iterations a round.")
     focal_steps: Repeats = Field(default=2, description="Corrections of the focal length by the motions.")
     final_iterations: Repeats = Field(default=2, description="Solver iterations with the corrected depth.")
+    flow_noise: NonNegativeFloat = Field(
+        default=0.0, description="How far small motions are held back: variance against the seen flow, cells^2."
+    )
     settling: Repeats = Field(default=8, description="Steps that bring all motions of a clip together.")
 
 
