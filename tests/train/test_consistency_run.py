@@ -21,11 +21,12 @@ from consistency_runs import run_settings, run_values, totals, write_init, write
 from bathyscope.errors import DatasetError, SettingsError, TrainingError
 from bathyscope_train.consistency import clip_step
 from bathyscope_train.consistency.checkpoint_folder import checkpoint_folders, read_last_checkpoint
-from bathyscope_train.consistency.journal import drop_after, spoken
+from bathyscope_train.consistency.journal import spoken
 from bathyscope_train.consistency.settings import SafetySettings
 from bathyscope_train.consistency.start import open_training_windows
 from bathyscope_train.consistency.trainer import optimise
 from bathyscope_train.consistency.watch import Watch
+from bathyscope_train.metrics_file import drop_after
 from bathyscope_train.model.checkpoints import load_network, training_of
 
 COMMAND = "import sys; from bathyscope.cli import main; sys.argv = ['bathyscope', *sys.argv[1:]]; main()"

@@ -21,9 +21,10 @@ from bathyscope_train.data.window_sources import WindowSources, named_domain
 from bathyscope_train.data.windows import Augmentation, cut_window
 from bathyscope_train.devices import choose_device, use_bfloat16
 from bathyscope_train.losses.supervised import supervised_objective
+from bathyscope_train.metrics_file import METRICS_FILE
 from bathyscope_train.model.network import Network
 from bathyscope_train.model.presets import get_preset
-from bathyscope_train.pretrain import METRICS_FILE, draw_pairs, pretrain
+from bathyscope_train.pretrain import draw_pairs, pretrain
 from bathyscope_train.pretrain_record import training_record
 from bathyscope_train.training_state import STATE_FILE
 

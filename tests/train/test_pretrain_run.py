@@ -18,6 +18,7 @@ from bathyscope_train.data.synthetic.shards import write_clips
 from bathyscope_train.data.truth_clips import read_truth_clips
 from bathyscope_train.devices import use_bfloat16
 from bathyscope_train.losses.supervised import supervised_objective
+from bathyscope_train.metrics_file import METRICS_FILE
 from bathyscope_train.model import Network
 from bathyscope_train.model.checkpoints import load_network, save_checkpoint, training_of
 from bathyscope_train.model.presets import (
@@ -27,7 +28,7 @@ from bathyscope_train.model.presets import (
     NetworkPreset,
     VitSettings,
 )
-from bathyscope_train.pretrain import METRICS_FILE, WEIGHTS_FILE, draw_pairs, pretrain
+from bathyscope_train.pretrain import WEIGHTS_FILE, draw_pairs, pretrain
 from bathyscope_train.pretrain_record import training_record
 from bathyscope_train.schedule import ema_decay, learning_rate_factor, source_shares
 from bathyscope_train.training_state import STATE_FILE
@@ -102,8 +103,12 @@ def test_an_interrupted_run_goes_on_where_it_stopped(
         with pytest.raises(KeyboardInterrupt):
             pretrain(chosen)
     assert torch.load(tmp_path / "parts" / STATE_FILE, weights_only=True)["step"] == 2
+    with (tmp_path / "parts" / METRICS_FILE).open("a") as file:
+        file.write('{"step": 2, "depth": 0.5}\n{"step": 3, "depth": 0.5}\n{"step": 3, "de')
     parts = load_file(pretrain(chosen))
     assert all(torch.equal(whole[name], parts[name]) for name in whole)
+    told = [json.loads(line) for line in (tmp_path / "parts" / METRICS_FILE).read_text().splitlines()]
+    assert told == [{"step": 2, "depth": 0.5}], "lines about steps that are done again go"
 
 
 def test_the_weights_say_how_they_were_made_but_not_on_whose_machine(clips: Path, tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from bathyscope_train.data.window_sources import WindowSources
 from bathyscope_train.data.windows import TruthClip
 from bathyscope_train.devices import choose_device, use_bfloat16
 from bathyscope_train.losses.supervised import SolverInput, supervised_objective
+from bathyscope_train.metrics_file import METRICS_FILE, drop_after
 from bathyscope_train.model.checkpoints import load_network, save_checkpoint
 from bathyscope_train.model.lite0 import Lite0Encoder
 from bathyscope_train.model.matching_camera_head import MatchingCameraHead
@@ -35,7 +36,6 @@ from bathyscope_train.workers import average, launch, share_gradients
 
 LOG_STEPS = 10
 WEIGHTS_FILE = "model.safetensors"
-METRICS_FILE = "metrics.jsonl"
 
 ENCODER = "aggregator.patch_embed.encoder."
 """What names of parameters of a pre-trained encoder begin with."""
@@ -79,6 +79,8 @@ class _Run:
         self.parameters = choose_parameters(self.network, settings.only)
         self.optimizer = torch.optim.AdamW(parameter_groups(self.network, settings), betas=(0.9, 0.98))
         self.position = read_state(settings.out, self.network, self.average, self.optimizer)
+        if rank == 0:
+            drop_after(settings.out / METRICS_FILE, self.position.step)
         self.sources = WindowSources(
             settings.data, settings.render, device=self.device, seed=settings.seed, step=self.position.step
         )

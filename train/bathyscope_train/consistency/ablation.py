@@ -21,12 +21,12 @@ import numpy as np
 from bathyscope.errors import BathyscopeError, CheckpointError, TrainingError
 from bathyscope_train.consistency.ablation_settings import AblationSettings, load_ablation_settings, run_name
 from bathyscope_train.consistency.ablation_table import Outcome, tables
-from bathyscope_train.consistency.journal import METRICS_FILE
 from bathyscope_train.consistency.plan import make_plan
 from bathyscope_train.consistency.scores import ClipScores, Scores, score_clip, score_network
 from bathyscope_train.consistency.start import load_initial
 from bathyscope_train.consistency.trainer import optimise
 from bathyscope_train.data.windows import TruthClip
+from bathyscope_train.metrics_file import METRICS_FILE
 from bathyscope_train.model.checkpoints import load_network
 from bathyscope_train.model.network import Network
 from bathyscope_train.pretrain import held_out_clips

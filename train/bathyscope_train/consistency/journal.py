@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bathyscope.errors import SettingsError, TrainingError
+from bathyscope_train.metrics_file import METRICS_FILE, drop_after
 
-METRICS_FILE = "metrics.jsonl"
 TENSORBOARD_FOLDER = "tensorboard"
 
 _log = logging.getLogger(__name__)
@@ -92,22 +92,6 @@ class Journal:
         """Write what is left."""
         if self._events is not None:
             self._events.close()
-
-
-def drop_after(path: Path, step: int) -> None:
-    """Remove lines about steps after ``step``, and a last line that was cut short, from ``metrics.jsonl``."""
-    if not path.is_file():
-        return
-    kept = []
-    for line in path.read_text(encoding="utf-8").splitlines():
-        try:
-            if json.loads(line)["step"] <= step:
-                kept.append(line)
-        except (ValueError, KeyError):
-            continue
-    beside = path.with_name(f".{path.name}")
-    beside.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
-    beside.replace(path)
 
 
 def spoken(seconds: float) -> str:
