@@ -42,6 +42,7 @@ train-default: .venv/installed $(ENCODER)
 		$(SYNTHETIC) clips/$${domain}_val --domain $$domain --first 900000 --count 24 > /dev/null || exit 1; done
 	$(BIN)/bathyscope train configs/source.yaml
 	$(BIN)/bathyscope train configs/pretrain.yaml
+	$(BIN)/bathyscope train configs/settle.yaml
 	$(BIN)/bathyscope export runs/tiny/model.safetensors runs/tiny/bundle --half-weights --replace
 	@$(BIN)/python -c "import hashlib, pathlib; [print(hashlib.sha256(pathlib.Path(folder, 'weights.bin').read_bytes()) \
 		.hexdigest(), folder) for folder in ('runs/tiny/bundle', 'core/bathyscope/models/tiny')]"

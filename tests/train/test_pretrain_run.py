@@ -25,6 +25,7 @@ from bathyscope_train.model.presets import (
     AggregatorSettings,
     DptSettings,
     IterativeCameraSettings,
+    MatchingCameraSettings,
     NetworkPreset,
     VitSettings,
 )
@@ -130,6 +131,14 @@ def test_a_run_can_start_from_the_weights_of_another(clips: Path, tmp_path: Path
     assert max(float((before[name] - after[name]).abs().max()) for name in before) < 1e-6
 
 
+def test_a_run_can_change_how_far_small_motions_are_held_back(clips: Path, tmp_path: Path) -> None:
+    first = pretrain(settings(clips, tmp_path / "first", steps=1))
+    path = pretrain(settings(clips, tmp_path / "second", initial=first, steps=1, flow_noise=0.25, peak_lr=1e-9))
+    before, after = load_network(first)[0].preset, load_network(path)[0].preset
+    assert isinstance(before.camera, MatchingCameraSettings)
+    assert after == before.model_copy(update={"camera": before.camera.model_copy(update={"flow_noise": 0.25})})
+
+
 def test_a_damaged_state_is_refused_by_name(clips: Path, tmp_path: Path) -> None:
     (tmp_path / STATE_FILE).write_bytes(b"not a state")
     with pytest.raises(CheckpointError, match=STATE_FILE):
@@ -181,7 +190,7 @@ def test_settings_that_cannot_work_are_refused(tmp_path: Path, text: str, overri
         load_settings(file, overrides)
 
 
-@pytest.mark.parametrize("name", ["source.yaml", "pretrain.yaml", "pretrain_gpu.yaml"])
+@pytest.mark.parametrize("name", ["source.yaml", "pretrain.yaml", "settle.yaml", "pretrain_gpu.yaml"])
 def test_the_shipped_settings_are_valid(name: str) -> None:
     path = Path(__file__).parents[2] / "configs" / name
     assert load_settings(path, ["minutes=5"]).minutes == 5

@@ -4,7 +4,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal, Self
 
-from pydantic import BaseModel, Field, NonNegativeInt, PositiveFloat, PositiveInt, ValidationError, model_validator
+from pydantic import (
+    BaseModel,
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+    model_validator,
+)
 
 from bathyscope.errors import SettingsError
 from bathyscope_train.losses.supervised import LossWeights
@@ -62,6 +71,9 @@ class PretrainSettings(BaseModel, frozen=True, extra="forbid"):
         default=None, description="Published EfficientNet-Lite0 weights, for a fresh network with that encoder."
     )
     encoder_rate: PositiveFloat = Field(default=0.1, description="Learning rate of that encoder over that of the rest.")
+    flow_noise: NonNegativeFloat | None = Field(
+        default=None, description="How far the camera head holds small motions back, instead of what the network says."
+    )
     only: str = Field(default="", description="Train only parameters whose names start so, as gaussian_param_head.")
     minutes: PositiveFloat = Field(default=30.0, description="Wall-clock budget; the learning rate follows it.")
     steps: PositiveInt | None = Field(default=None, description="Budget in steps instead: the same bits for a seed.")

@@ -211,7 +211,15 @@ def initial_network(settings: PretrainSettings) -> Network:
         raise SettingsError(
             f"preset {network.preset.name!r} has no matching camera head; pre-training needs one, as in 'tiny'"
         )
-    return network
+    return network if settings.flow_noise is None else _holding_back(network, settings.flow_noise)
+
+
+def _holding_back(network: Network, flow_noise: float) -> Network:
+    """The same weights with another prior on motion."""
+    camera = network.preset.camera.model_copy(update={"flow_noise": flow_noise})
+    changed = Network(network.preset.model_copy(update={"camera": camera}))
+    changed.load_state_dict(network.state_dict())
+    return changed
 
 
 def _encoder(network: Network) -> Lite0Encoder:
