@@ -90,8 +90,9 @@ class SceneSession(DepthSession):
                 known=grid.inside & (view.depth > 0),
                 world_from_camera=view.world_from_camera,
                 intrinsics=view.intrinsics,
+                single=single,
             )
-            for frame, view in zip(window.items, views, strict=True)
+            for frame, view, single in zip(window.items, views, maps.depth, strict=True)
         ]
 
 

@@ -1,4 +1,9 @@
-"""Bring the windows of a video into one world for each segment, and hand out frames as they become final."""
+"""Bring the windows of a video into one world for each segment, and hand out frames as they become final.
+
+Windows are scaled by the depth that shared frames have by themselves. Rendered depth leans towards the rest of its
+window: at the end of one to what came before, at the start of the next to what comes after. Scaled by it, windows of
+a camera that withdraws would shrink one after the other.
+"""
 
 from __future__ import annotations
 
@@ -32,6 +37,8 @@ class SmallDepth:
     """(4, 4)"""
     intrinsics: F64
     """(3, 3) in pixels of the network's image."""
+    single: F32 | None = None
+    """(h, w) depth as the frame has it by itself, which windows are scaled by; ``depth`` unless given."""
     segment: int = 0
 
     def moved(self, motion: Similarity, segment: int) -> SmallDepth:
@@ -39,6 +46,7 @@ class SmallDepth:
         return replace(
             self,
             depth=(self.depth * np.float32(motion.scale)).astype(np.float32),
+            single=None if self.single is None else (self.single * np.float32(motion.scale)).astype(np.float32),
             world_from_camera=motion.poses(self.world_from_camera),
             segment=segment,
         )
@@ -140,7 +148,7 @@ def blend(first: SmallDepth, second: SmallDepth, share: float) -> SmallDepth:
 
 def _together(frames: tuple[SmallDepth, ...]) -> SharedFrames:
     return SharedFrames(
-        np.stack([frame.depth for frame in frames]),
+        np.stack([frame.depth if frame.single is None else frame.single for frame in frames]),
         np.stack([frame.known for frame in frames]),
         np.stack([frame.world_from_camera for frame in frames]),
     )

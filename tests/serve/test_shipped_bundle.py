@@ -21,7 +21,7 @@ def bundle() -> Bundle:
 def test_the_shipped_bundle_is_under_forty_megabytes_and_may_be_used_in_products(bundle: Bundle) -> None:
     assert sum(entry.bytes for entry in bundle.manifest.files.values()) < 40e6
     assert not bundle.manifest.research_only
-    assert bundle.manifest.training["data"]["ground_truth"].startswith("exact, rendered")
+    assert bundle.manifest.training["ground_truth"].startswith("exact, rendered")
 
 
 def test_the_shipped_graphs_were_held_to_torch_within_the_limits_at_several_lengths_and_sizes(bundle: Bundle) -> None:

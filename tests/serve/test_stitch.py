@@ -147,6 +147,27 @@ def test_the_overlap_goes_over_from_one_window_to_the_next_without_a_jump() -> N
     assert {item.segment for item in out} == {0}
 
 
+def test_windows_are_scaled_by_what_each_frame_alone_says() -> None:
+    """Rendered depth leans towards the rest of its window: 10 % low at its end, 10 % high at its start."""
+    stitcher = Stitcher(2, SETTINGS)
+
+    def window(first: int, scale: float) -> list[SmallDepth]:
+        lean = {0: 1.1, 1: 1.1, 4: 0.9, 5: 0.9}
+        return [
+            replace(
+                frame(first + k, scale * lean.get(k, 1.0), x=scale * 0.1 * k), single=np.full((4, 5), scale, np.float32)
+            )
+            for k in range(6)
+        ]
+
+    out = list(stitcher.add(window(0, 1.0), shared=0))
+    for number in range(1, 6):
+        out += stitcher.add(window(4 * number, 2.0**number), shared=2)
+    out += stitcher.finish()
+    middles = [item.depth[0, 0] for item in out if item.index % 4 in {2, 3}]
+    np.testing.assert_allclose(middles[:-2], 1.0, rtol=1e-5)
+
+
 def test_a_failed_alignment_begins_a_segment_and_says_so() -> None:
     stitcher = Stitcher(2, SETTINGS)
     out = list(stitcher.add([frame(i, 1.0) for i in range(4)], shared=0))

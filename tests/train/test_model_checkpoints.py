@@ -297,7 +297,7 @@ def test_settings_may_name_the_shipped_checkpoint() -> None:
 def test_the_shipped_checkpoint_is_that_of_the_shipped_bundle() -> None:
     network, report = load_network(shipped_checkpoint())
     assert report.complete
-    assert network.preset.name == "tiny"
+    assert network.preset.name == "tiny-lite0"
     bundle = Bundle.open(shipped_bundle())
     assert training_of(shipped_checkpoint()) == bundle.manifest.training
     weights = (bundle.folder / "weights.bin").read_bytes()

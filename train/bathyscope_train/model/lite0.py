@@ -113,6 +113,7 @@ class Lite0Encoder(nn.Module):
 
 
 def _read(path: Path) -> Mapping[str, Tensor]:
+    """The published file is older than PyTorch's zip format, which ``weight_files`` reads; tensors only, no code."""
     try:
         found = torch.load(path, map_location="cpu", weights_only=True)
     except OSError as error:
