@@ -2,7 +2,7 @@
 
 Windows are scaled by the depth that shared frames have by themselves. Rendered depth leans towards the rest of its
 window: at the end of one to what came before, at the start of the next to what comes after. Scaled by it, windows of
-a camera that withdraws would shrink one after the other.
+a camera that keeps advancing would shrink one after the other.
 """
 
 from __future__ import annotations
