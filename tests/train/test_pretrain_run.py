@@ -139,6 +139,12 @@ def test_a_run_can_change_how_far_small_motions_are_held_back(clips: Path, tmp_p
     assert after == before.model_copy(update={"camera": before.camera.model_copy(update={"flow_noise": 0.25})})
 
 
+def test_what_is_wrong_in_a_worker_is_told_as_if_there_were_one(clips: Path, tmp_path: Path) -> None:
+    chosen = settings(clips, tmp_path, preset="tiny-lite0", encoder=tmp_path / "none.pth", workers=2, batch=2)
+    with pytest.raises(CheckpointError, match=r"^[^\n]*none.pth: cannot be read[^\n]*$"):
+        pretrain(chosen)
+
+
 def test_a_damaged_state_is_refused_by_name(clips: Path, tmp_path: Path) -> None:
     (tmp_path / STATE_FILE).write_bytes(b"not a state")
     with pytest.raises(CheckpointError, match=STATE_FILE):

@@ -4,6 +4,7 @@ On a shared CPU two processes of one thread beat one process of two: they meet o
 operation.
 """
 
+import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,7 +14,10 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from bathyscope.errors import SettingsError
+from bathyscope import errors
+from bathyscope.errors import BathyscopeError, SettingsError
+
+_TOLD = "error-{rank}.json"
 
 
 def launch(work: Callable[[int], None], workers: int) -> None:
@@ -24,6 +28,7 @@ def launch(work: Callable[[int], None], workers: int) -> None:
 
     Raises:
         SettingsError: If ``torchrun`` started another number of processes.
+        BathyscopeError: What a worker raised.
     """
     if "RANK" in os.environ:
         started = int(os.environ["WORLD_SIZE"])
@@ -33,10 +38,16 @@ def launch(work: Callable[[int], None], workers: int) -> None:
     elif workers == 1:
         work(0)
     else:
-        from torch.multiprocessing.spawn import spawn
+        from torch.multiprocessing.spawn import ProcessExitedException, spawn
 
-        meeting = Path(mkdtemp(prefix="bathyscope-train-")) / "meeting"
-        spawn(_join, args=(meeting.as_uri(), workers, work), nprocs=workers)
+        folder = Path(mkdtemp(prefix="bathyscope-train-"))
+        try:
+            spawn(_join, args=(folder, workers, work), nprocs=workers)
+        except ProcessExitedException:
+            for file in folder.glob(_TOLD.format(rank="*")):
+                kind, message = json.loads(file.read_text(encoding="utf-8"))
+                raise getattr(errors, kind)(message) from None
+            raise
 
 
 def share_gradients(parameters: Sequence[nn.Parameter], progress: float) -> float:
@@ -68,8 +79,14 @@ def average(values: Tensor) -> Tensor:
     return values
 
 
-def _join(rank: int, meeting: str, workers: int, work: Callable[[int], None]) -> None:
-    _work(meeting, rank, workers, work)
+def _join(rank: int, folder: Path, workers: int, work: Callable[[int], None]) -> None:
+    """A spawned worker; an error of ours is left in the folder, for the parent to raise it as it was."""
+    try:
+        _work((folder / "meeting").as_uri(), rank, workers, work)
+    except BathyscopeError as error:
+        told = folder / _TOLD.format(rank=rank)
+        told.write_text(json.dumps([type(error).__name__, str(error)]), encoding="utf-8")
+        raise SystemExit(1) from error
 
 
 def _work(meeting: str, rank: int, workers: int, work: Callable[[int], None]) -> None:

