@@ -2,7 +2,7 @@
 #
 #   make demo [CLIP=video]   a clip through service and client; outputs in demo/
 #   make test                the whole test suite        make quick   without the slow tests
-#   make train-default       train the shipped network anew and export it: two hours on two processors
+#   make train-default       train the shipped network anew and export it: four hours on two processors
 #   make train-gpu-slice     train on a GPU for at most 9.5 minutes; again goes on. OUT=folder also gets the weights
 #   make check               style, types, layers, spelling
 #   make clean               remove what these commands installed and cached
@@ -38,11 +38,14 @@ train-default: .venv/installed $(ENCODER)
 	$(SYNTHETIC) clips/source --domain source --count 200 > /dev/null
 	$(SYNTHETIC) clips/typical --domain typical --first 3000 --count 720 > /dev/null
 	$(SYNTHETIC) clips/broad --domain broad --first 1000 --count 720 > /dev/null
-	for domain in source typical broad shifted; do \
+	$(SYNTHETIC) clips/tubes --domain tubes --first 5000 --count 720 > /dev/null
+	$(SYNTHETIC) clips/typical_more --domain typical --first 3720 --count 480 > /dev/null
+	$(SYNTHETIC) clips/broad_more --domain broad --first 1720 --count 480 > /dev/null
+	for domain in source typical tubes broad shifted; do \
 		$(SYNTHETIC) clips/$${domain}_val --domain $$domain --first 900000 --count 24 > /dev/null || exit 1; done
 	$(BIN)/bathyscope train configs/source.yaml
 	$(BIN)/bathyscope train configs/pretrain.yaml
-	$(BIN)/bathyscope train configs/settle.yaml
+	$(BIN)/bathyscope train configs/finish.yaml
 	$(BIN)/bathyscope export runs/tiny/model.safetensors runs/tiny/bundle --half-weights --replace
 	@$(BIN)/python -c "import hashlib, pathlib; [print(hashlib.sha256(pathlib.Path(folder, 'weights.bin').read_bytes()) \
 		.hexdigest(), folder) for folder in ('runs/tiny/bundle', 'core/bathyscope/models/tiny')]"

@@ -196,7 +196,7 @@ def test_settings_that_cannot_work_are_refused(tmp_path: Path, text: str, overri
         load_settings(file, overrides)
 
 
-@pytest.mark.parametrize("name", ["source.yaml", "pretrain.yaml", "settle.yaml", "pretrain_gpu.yaml"])
+@pytest.mark.parametrize("name", ["source.yaml", "pretrain.yaml", "finish.yaml", "pretrain_gpu.yaml"])
 def test_the_shipped_settings_are_valid(name: str) -> None:
     path = Path(__file__).parents[2] / "configs" / name
     assert load_settings(path, ["minutes=5"]).minutes == 5

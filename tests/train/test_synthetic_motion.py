@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from bathyscope_train.data.synthetic import DOMAINS
-from bathyscope_train.data.synthetic.clip import plan_clip
+from bathyscope_train.data.synthetic.clip import plan_clip, render_clip
 from bathyscope_train.data.synthetic.domain import CameraRanges
 from bathyscope_train.data.synthetic.scene import NOTHING
 from bathyscope_train.data.synthetic.solid_tracing import solid_clearance
@@ -40,6 +40,30 @@ def test_the_camera_is_in_free_space_all_the_time(family: str) -> None:
             scene, point = plan.scene_at(frame), pose[:3, 3]
             assert solid_clearance(scene.solids, *point) > 0
             assert scene.surface.kind == NOTHING or clearance(scene.surface, point) > 0
+
+
+def test_a_camera_that_hugs_the_wall_is_nearer_to_it_and_sees_the_way_ahead() -> None:
+    """The same tubes and speeds: the wall comes nearer, and depth spreads further in a picture."""
+    near, spread = [], []
+    for seed in range(6):
+        usual, hugging = (
+            DOMAINS["tubes"].model_copy(
+                update={
+                    "families": {"lumen": 1.0},
+                    "camera": DOMAINS["tubes"].camera.model_copy(update={"hugging": share}),
+                }
+            )
+            for share in (0.0, 1.0)
+        )
+        clips = [render_clip(seed, domain, frames=3, size=(28, 36)) for domain in (usual, hugging)]
+        plans = [plan_clip(seed, domain, frames=3, size=SIZE) for domain in (usual, hugging)]
+        near.append([min(clearance(p.scene.surface, pose[:3, 3]) for pose in p.scene_from_camera) for p in plans])
+        assert min(near[-1]) > 0
+        assert clips[0].intrinsics == pytest.approx(clips[1].intrinsics)
+        low, high = zip(*(np.quantile(clip.depth[clip.valid], (0.02, 0.98)) for clip in clips), strict=True)
+        spread.append(np.divide(high, low))
+    assert np.median(near, 0)[1] < 0.5 * np.median(near, 0)[0]
+    assert np.median(spread, 0)[1] > 1.5 * np.median(spread, 0)[0]
 
 
 def test_a_slow_clip_moves_as_much_less_as_its_speed_says() -> None:

@@ -137,6 +137,9 @@ class CameraRanges(_Ranges):
     """Amplitude of the tremor's turns; its shifts match them at the distance looked at."""
     pausing: Share = 0.0
     """Share of clips in which the camera stops for a while."""
+    hugging: Share = 0.0
+    """Share of clips through tubes whose camera keeps near the wall, as a colonoscope mostly does: millimetres and the
+    far end of the lumen in one picture."""
 
 
 class LifeRanges(_Ranges):

@@ -5,6 +5,8 @@ Each is a file beside this module, in the format of ``Domain.from_file``:
 * ``source``: narrow; pink mucosa, inverse-square light, little noise. A small model learns it within minutes. It is
   what the ranges default to.
 * ``typical``: moderate ranges of everything: what most endoscopes and tissues look like.
+* ``tubes``: the looks of ``typical`` in colons and noses, the camera mostly near a wall and the way ahead in view: the
+  farthest thing in a picture is ten to thirty times as far as the nearest.
 * ``broad``: wide ranges of everything, the far ends included: narrow and fish-eye views, strong haze, paint and smear.
 * ``shifted``: never trained on; pale and yellowish, spotted, slow fall-off, narrow beam, strong highlights.
 """
@@ -16,7 +18,7 @@ from pathlib import Path
 from bathyscope_train.data.synthetic.domain import Domain
 
 _FOLDER = Path(__file__).with_name("domains")
-_NAMES = ("source", "typical", "broad", "shifted")
+_NAMES = ("source", "typical", "tubes", "broad", "shifted")
 
 
 class NamedDomains(Mapping[str, Domain]):

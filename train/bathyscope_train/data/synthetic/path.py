@@ -35,6 +35,7 @@ _MANNERS = {
 _TRIES = 60
 _SHARE_PER_FRAME = 0.03  # of the mean depth, moved in one frame at speed 1
 _TURN_DEG = 11.0  # amplitude of the slow swing at speed 1 and a view of 80 degrees
+_BESIDE_THE_WALL = 0.5, 0.85  # of the radius from the middle of a tube
 
 
 def _swing(random: np.random.Generator, frames: int, periods: tuple[float, float] = (26.0, 60.0)) -> Array:
@@ -77,7 +78,7 @@ def camera_path(  # noqa: PLR0917 - what decides the path, in the order of its m
 
     Args:
         random: Source of the path.
-        hand: Source of slowness, pauses and tremor, so that a path is the same with and without them.
+        hand: Source of slowness, pauses, tremor and nearness to the wall, so that a path is the same without them.
         scene: Where the camera moves.
         ranges: Speeds and kinds of path.
         fov_deg: Horizontal field of view; narrow views move and turn less.
@@ -91,9 +92,12 @@ def camera_path(  # noqa: PLR0917 - what decides the path, in the order of its m
     pace = speed * min(1.0, fov_deg / 80.0)
     if scene.stage is not None:
         positions, forward = _on_stage(random, scene, scene.stage, manner, pace, frames)
+    elif scene.surface.kind == TUBE:
+        wall = hand.spawn(1)[0]
+        near = wall if wall.uniform() < ranges.hugging else None
+        positions, forward = _through_tube(random, near, scene.surface, manner, pace, frames)
     else:
-        place = _through_tube if scene.surface.kind == TUBE else _over_field
-        positions, forward = place(random, scene.surface, manner, pace, frames)
+        positions, forward = _over_field(random, scene.surface, manner, pace, frames)
     if kind == "orbit":
         forward = _round(positions, forward)
     elif kind == "parallel":
@@ -185,9 +189,15 @@ def _keep_clear(surface: Surface, base: Array, offset: Array, margin_mm: float) 
     )
 
 
-def _through_tube(
-    random: np.random.Generator, surface: Surface, manner: _Manner, pace: float, frames: int
+def _through_tube(  # noqa: PLR0917 - as above
+    random: np.random.Generator,
+    wall: np.random.Generator | None,
+    surface: Surface,
+    manner: _Manner,
+    pace: float,
+    frames: int,
 ) -> tuple[Array, Array]:
+    """Along the centreline; with ``wall``, the source of how, near the wall and looking further ahead."""
     rows = len(surface.centre)
     z = surface.first[0] + surface.step[0] * np.arange(rows)
     radius = float(np.median(surface.heights[rows // 4 : -rows // 4]))
@@ -206,8 +216,13 @@ def _through_tube(
         amplitude = 0.22 * radius * pace * manner.across
         offset[:, axis] = amplitude * _swing(random, frames) + random.uniform(-0.3, 0.3) * radius
     base = centre(along)
-    positions = _keep_clear(surface, base, offset, 0.12 * radius)
-    return positions, centre(along + random.uniform(1.6, 3.0) * radius) - positions
+    ahead, margin = random.uniform(1.6, 3.0), 0.12
+    if wall is not None:
+        side, share = wall.uniform(0, 2 * np.pi), wall.uniform(*_BESIDE_THE_WALL)
+        offset += share * radius * np.array([np.cos(side), np.sin(side), 0.0]) - 0.7 * offset[0]
+        ahead, margin = wall.uniform(2.0, 6.0), 0.07
+    positions = _keep_clear(surface, base, offset, margin * radius)
+    return positions, centre(along + ahead * radius) - positions
 
 
 def _over_field(
