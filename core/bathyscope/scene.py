@@ -171,6 +171,29 @@ def assemble_scene(
     return Scene(moved, move_gaussians(gaussians, first))
 
 
+def frame_gaussians(
+    raw: F32, depth: F32, image: F32, camera: Cameras, spec: SceneSpec, *, inside: NDArray[np.bool_]
+) -> Gaussians:
+    """Gaussians of one frame, without colours, in the world of its camera.
+
+    Args:
+        raw: (g, h, w) raw channels.
+        depth: (h, w)
+        image: (3, h, w) RGB in [0, 1].
+        camera: Of this frame alone.
+        spec: The bundle's reading of the raw maps.
+        inside: (h, w) pixels that may become Gaussians.
+
+    Raises:
+        GeometryError: If this network's Gaussians are not those of a frame, but fused over a window.
+    """
+    if spec.activation != "footprint":
+        raise GeometryError(f"{spec.activation} Gaussians belong to a window, not to a frame")
+    points = unproject_window(depth[None], camera, spec.pixel_centre)[0]
+    plain = np.concatenate([raw[:11], raw[-1:]])
+    return _of_frame(plain, depth, image, points, cameras=camera, t=0, inside=inside)
+
+
 def _fused(raw: F32, points: F64, keep: NDArray[np.bool_], spec: SceneSpec) -> Gaussians:
     kept = raw.transpose(0, 2, 3, 1)[keep]
     means, features, confidence = points[keep], kept[:, :-1], kept[:, -1]

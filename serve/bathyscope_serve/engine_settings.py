@@ -22,6 +22,18 @@ class StitchSettings(BaseModel, frozen=True, extra="forbid"):
     least_share: PositiveFloat = Field(default=0.05, description="Share of the pixels that the scale must rest on.")
 
 
+class PaceSettings(BaseModel, frozen=True, extra="forbid"):
+    """How far apart the frames of a window are chosen."""
+
+    motion: PositiveFloat = Field(
+        default=0.012, description="Median motion of the picture between key frames, as a share of its width."
+    )
+    longest: PositiveInt = Field(
+        default=5,
+        description="Frames after which a key frame follows even if nothing moved; 1 makes windows of neighbours.",
+    )
+
+
 class EngineSettings(BaseModel, frozen=True, extra="forbid"):
     """How clips are run through a bundle."""
 
@@ -34,6 +46,7 @@ class EngineSettings(BaseModel, frozen=True, extra="forbid"):
     least_opacity: NonNegativeFloat = Field(
         default=0.3, le=1.0, description="Rendered depth below this opacity is replaced by the depth head's."
     )
+    pace: PaceSettings = PaceSettings()
     stitch: StitchSettings = StitchSettings()
     cuts: CutSettings = CutSettings()
     decode: DecodeLimits = DecodeLimits()

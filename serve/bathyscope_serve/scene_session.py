@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bathyscope.camera import invert_pose, rebase
 from bathyscope.clip import FrameSequence
 from bathyscope.engines import DepthOptions, WindowModel
 from bathyscope.errors import SettingsError
 from bathyscope.model_spec import InputSpec, SceneSpec
 from bathyscope.result import DepthKind, FrameDepth, ResultMeta
-from bathyscope.scene import Cameras, Scene, assemble_scene, with_focal
+from bathyscope.scene import Cameras, Scene, WindowMaps, assemble_scene, decode_cameras, with_focal
+from bathyscope.splat import prepare
 from bathyscope.vision.field_of_view import FieldOfView, find_field_of_view
 from bathyscope.vision.grid import Grid
+from bathyscope_serve.blocks import Block, cut_blocks
 from bathyscope_serve.frames import FrameSource, SequenceSource
+from bathyscope_serve.pace import paced
+from bathyscope_serve.placed import FrameScene, PlacedFrame, WindowScene
 from bathyscope_serve.session import DepthSession, Job, SmallFrame
-from bathyscope_serve.stitch import SmallDepth, Stitcher
-from bathyscope_serve.window_depth import Map, render_window
-from bathyscope_serve.windows import Window, cut_windows
+from bathyscope_serve.stitch import Stitcher
+from bathyscope_serve.views import Map, Views
+
+F32 = NDArray[np.float32]
 
 
 class SceneSession(DepthSession):
@@ -42,58 +49,103 @@ class SceneSession(DepthSession):
 
     def _estimates(self, source: FrameSource, field_of_view: FieldOfView) -> Iterator[FrameDepth]:
         grid = Grid.fit(field_of_view, self._job.input)
-        stitcher = Stitcher(self._job.input.overlap, self._job.settings.stitch)
-        known = self._job.options.known_intrinsics
+        stitcher = Stitcher(self._job.settings.stitch)
         try:
-            for small in self._stitched(source, grid, stitcher):
-                with self._timed("upsample"):
-                    frame = _at_source_size(small, grid)
-                yield frame if known is None else replace(frame, intrinsics=known)
+            for small in self._rendered(self._placed(source, grid, stitcher), grid):
+                yield self._result(small, grid)
         finally:
             self._warnings.extend(stitcher.warnings)
 
-    def _stitched(self, source: FrameSource, grid: Grid, stitcher: Stitcher) -> Iterator[SmallDepth]:
-        """Frames of the result at the network's size, as they become final."""
-        wanted = self._job.input
-        frames = self._frames(source, grid.to_model, grid.inside)
-        for window in cut_windows(frames, wanted.window, wanted.overlap):
-            depth = self._depth(window, grid)
-            with self._timed("stitch"):
-                final = list(stitcher.add(depth, window.shared))
-            yield from final
-        yield from stitcher.finish()
+    def _rendered(self, placed: Iterable[list[PlacedFrame]], grid: Grid) -> Iterator[PlacedFrame]:
+        """The frames with the depth that was asked for."""
+        views = Views(
+            self._scene,
+            inside=grid.inside,
+            depth=self._depth_kind,
+            window=self._job.input.window,
+            least_opacity=self._job.settings.least_opacity,
+            run=self._renderers,
+        )
+        for frames in placed:
+            with self._timed("splat"):
+                ready = views.add(frames)
+            self._checkpoint()
+            yield from ready
+        with self._timed("splat"):
+            ready = views.finish()
+        yield from ready
 
-    def _depth(self, window: Window[SmallFrame], grid: Grid) -> list[SmallDepth]:
-        images = np.stack([frame.image for frame in window.items])
+    def _result(self, small: PlacedFrame, grid: Grid) -> FrameDepth:
+        known = self._job.options.known_intrinsics
+        with self._timed("upsample"):
+            frame = _at_source_size(small, grid)
+        return frame if known is None else replace(frame, intrinsics=known)
+
+    def _placed(self, source: FrameSource, grid: Grid, stitcher: Stitcher) -> Iterator[list[PlacedFrame]]:
+        """Frames in the world of their segment, as their places become final; the last list is of all that is left."""
+        wanted = self._job.input
+        frames = paced(self._frames(source, grid.to_model, grid.inside), self._job.settings.pace, grid.inside)
+        for block in cut_blocks(frames, wanted.window, wanted.overlap):
+            if block.shared == 0:
+                stitcher.cut(block.items[0].index)
+            self._place(block, grid, stitcher)
+            yield stitcher.take(block.items[block.kept].index if block.kept < len(block.items) else None)
+        yield stitcher.take()
+
+    def _place(self, block: Block[SmallFrame], grid: Grid, stitcher: Stitcher) -> None:
+        """Give the block's windows to the stitcher; if they do not fit together, windows of neighbours instead."""
+        wanted, windows = self._job.input, iter(block.windows)
+        if len(block.windows) > 1:
+            woven = [self._seen(block, places, grid) for places in windows]
+            with self._timed("stitch"):
+                fits = stitcher.weave(woven)
+            if fits:
+                return
+            windows = block.in_order(wanted.window, wanted.overlap)
+        for places in windows:
+            seen = self._seen(block, places, grid)
+            with self._timed("stitch"):
+                stitcher.add(seen)
+
+    def _seen(self, block: Block[SmallFrame], places: tuple[int, ...], grid: Grid) -> list[PlacedFrame]:
+        """What the network makes of one window of a block, in the world of its first camera."""
+        window = [block.items[place] for place in places]
+        images = np.stack([frame.image for frame in window])
         focal = known_focal(self._job.options, grid)
         with self._timed("network"):
             maps = self._model.predict(images, self._checkpoint, focal=focal)
         if focal is not None:
             maps = with_focal(maps, focal, self._scene.focal_epsilon)
-        with self._timed("splat"):
-            views = render_window(
-                maps,
-                images,
-                self._scene,
-                inside=grid.inside,
-                depth=self._depth_kind,
-                least_opacity=self._job.settings.least_opacity,
-                run=self._renderers,
-            )
         self._checkpoint()
+        cameras = decode_cameras(maps.pose_encoding, maps.size, self._scene.focal_epsilon)
+        poses = rebase(cameras.world_from_camera)
+        keys = set(block.windows[0])
         return [
-            SmallDepth(
+            PlacedFrame(
                 index=frame.index,
                 timestamp_s=frame.timestamp_s,
-                depth=view.depth,
-                confidence=view.confidence,
-                known=grid.inside & (view.depth > 0),
-                world_from_camera=view.world_from_camera,
-                intrinsics=view.intrinsics,
-                single=single,
+                depth=maps.depth[k],
+                confidence=maps.confidence[k],
+                known=grid.inside,
+                world_from_camera=poses[k],
+                intrinsics=cameras.intrinsics[k],
+                key=places[k] in keys,
+                scene=scene,
             )
-            for frame, view, single in zip(window.items, views, maps.depth, strict=True)
+            for k, (frame, scene) in enumerate(zip(window, self._scenes(maps, images, grid), strict=True))
         ]
+
+    def _scenes(self, maps: WindowMaps, images: F32, grid: Grid) -> Sequence[FrameScene | WindowScene | None]:
+        """What each frame of a window is to be rendered from."""
+        if self._depth_kind == "head" or maps.gaussians is None:
+            return [None] * len(images)
+        if self._scene.activation == "footprint":
+            return [FrameScene(image, raw) for image, raw in zip(images, maps.gaussians, strict=True)]
+        with self._timed("splat"):
+            valid = np.broadcast_to(grid.inside, maps.depth.shape)
+            scene = assemble_scene(maps, images, self._scene, valid=valid, colour=False)
+            gaussians = prepare(scene.gaussians)
+        return [WindowScene(gaussians, pose) for pose in invert_pose(scene.cameras.world_from_camera)]
 
 
 def scene_of_frames(
@@ -139,7 +191,7 @@ def _depth_kind(job: Job, scene: SceneSpec) -> DepthKind:
     return "head"
 
 
-def _at_source_size(small: SmallDepth, grid: Grid) -> FrameDepth:
+def _at_source_size(small: PlacedFrame, grid: Grid) -> FrameDepth:
     depth, valid = grid.to_source(small.depth, small.known)
     confidence, _ = grid.to_source(small.confidence, small.known)
     return FrameDepth(

@@ -98,10 +98,10 @@ def test_intrinsics_that_are_no_camera_are_refused_in_words(text: str) -> None:
 
 def test_frames_come_out_while_the_clip_is_still_being_read() -> None:
     engine, model = analytic_engine()
-    session = iter(engine.run(grey_clip(40), HEAD))
+    session = iter(engine.run(grey_clip(80), HEAD))
     first = [next(session).index for _ in range(4)]
     assert first == [0, 1, 2, 3]
-    assert len(model.windows) == 1
+    assert max(max(window) for window in model.windows) < 30
 
 
 def test_stride_and_limit_keep_the_source_numbers_and_times() -> None:
@@ -155,10 +155,11 @@ def test_a_closed_run_stops() -> None:
     session = engine.run(grey_clip(60), HEAD)
     frames = iter(session)
     next(frames)
+    seen = len(model.windows)
     session.close()
     with pytest.raises(StoppedError):
         list(frames)
-    assert len(model.windows) < 4
+    assert len(model.windows) == seen
 
 
 def test_a_missing_file_is_a_clip_error(tmp_path: Path) -> None:

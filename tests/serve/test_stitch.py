@@ -10,7 +10,8 @@ import pytest
 from bathyscope.camera import F64, Similarity, quaternion_to_matrix, rotation_angle
 from bathyscope_serve.alignment import Misfit, SharedFrames, align, blend_poses, geometric_median, mean_rotation
 from bathyscope_serve.engine_settings import StitchSettings
-from bathyscope_serve.stitch import SmallDepth, Stitcher, blend
+from bathyscope_serve.placed import PlacedFrame
+from bathyscope_serve.stitch import Stitcher, blend
 
 SETTINGS = StitchSettings()
 
@@ -109,11 +110,11 @@ def test_robust_means_ignore_one_of_five() -> None:
     np.testing.assert_allclose(geometric_median(points), [1, 2, 3], atol=1e-3)
 
 
-def frame(index: int, depth: float, *, known: bool = True, x: float = 0.0) -> SmallDepth:
+def frame(index: int, depth: float, *, known: bool = True, x: float = 0.0) -> PlacedFrame:
     pose = np.eye(4)
     pose[0, 3] = x
     shape = (4, 5)
-    return SmallDepth(
+    return PlacedFrame(
         index=index,
         timestamp_s=index / 25,
         depth=np.full(shape, depth, np.float32),
@@ -135,46 +136,65 @@ def test_a_blend_is_weighted_where_both_know_and_takes_who_knows_elsewhere() -> 
 
 def test_the_overlap_goes_over_from_one_window_to_the_next_without_a_jump() -> None:
     """Window 2 sees twice the scale and, after alignment, a depth that is 10 % larger away from the overlap."""
-    stitcher = Stitcher(3, SETTINGS)
-    out = list(stitcher.add([frame(i, 1.0, x=0.1 * i) for i in range(6)], shared=0))
+    stitcher = Stitcher(SETTINGS)
+    stitcher.add([frame(i, 1.0, x=0.1 * i) for i in range(6)])
+    out = stitcher.take(3)
     assert [item.index for item in out] == [0, 1, 2]
     second = [frame(i, 2.0, x=0.2 * (i - 3)) for i in range(3, 6)] + [frame(i, 2.2, x=0.2 * (i - 3)) for i in (6, 7, 8)]
-    out += stitcher.add(second, shared=3)
-    out += stitcher.finish()
+    stitcher.add(second)
+    out += stitcher.take()
     assert [item.index for item in out] == list(range(9))
     np.testing.assert_allclose([item.depth[0, 0] for item in out], [1] * 6 + [1.1] * 3, rtol=1e-5)
     np.testing.assert_allclose([item.world_from_camera[0, 3] for item in out], 0.1 * np.arange(9), atol=1e-5)
     assert {item.segment for item in out} == {0}
 
 
-def test_windows_are_scaled_by_what_each_frame_alone_says() -> None:
-    """Rendered depth leans towards the rest of its window: 10 % low at its end, 10 % high at its start."""
-    stitcher = Stitcher(2, SETTINGS)
+def window_of(places: tuple[int, ...], scale: float) -> list[PlacedFrame]:
+    """A camera that moves by 0.1 a frame before a wall at 1, in a world of another scale."""
+    return [frame(place, scale, x=scale * 0.1 * (place - places[0])) for place in places]
 
-    def window(first: int, scale: float) -> list[SmallDepth]:
-        lean = {0: 1.1, 1: 1.1, 4: 0.9, 5: 0.9}
-        return [
-            replace(
-                frame(first + k, scale * lean.get(k, 1.0), x=scale * 0.1 * k), single=np.full((4, 5), scale, np.float32)
-            )
-            for k in range(6)
-        ]
 
-    out = list(stitcher.add(window(0, 1.0), shared=0))
-    for number in range(1, 6):
-        out += stitcher.add(window(4 * number, 2.0**number), shared=2)
-    out += stitcher.finish()
-    middles = [item.depth[0, 0] for item in out if item.index % 4 in {2, 3}]
-    np.testing.assert_allclose(middles[:-2], 1.0, rtol=1e-5)
+def test_woven_windows_lie_in_one_world_whatever_their_scales() -> None:
+    stitcher = Stitcher(SETTINGS)
+    assert stitcher.weave([window_of((0, 3, 6), 1.0), window_of((0, 1, 4, 6), 3.0), window_of((0, 2, 5, 6), 0.2)])
+    out = stitcher.take(3)
+    assert stitcher.weave([window_of((3, 6, 9), 7.0), window_of((6, 7, 8, 9), 0.5)])
+    out += stitcher.take()
+    assert [item.index for item in out] == list(range(10))
+    np.testing.assert_allclose([item.depth[0, 0] for item in out], 1.0, rtol=1e-5)
+    np.testing.assert_allclose([item.world_from_camera[0, 3] for item in out], 0.1 * np.arange(10), atol=1e-5)
+
+
+def test_a_window_whose_ends_disagree_is_held_by_where_its_other_cameras_are_expected() -> None:
+    """The second window is turned by a tenth of a radian at one of its two ties only."""
+    turn = quaternion_to_matrix(np.array([np.cos(0.05), 0.0, 0.0, np.sin(0.05)]))
+    second = window_of((0, 1, 2, 4, 5, 6), 1.0)
+    second[0].world_from_camera[:3, :3] = turn
+    stitcher = Stitcher(SETTINGS)
+    assert stitcher.weave([window_of((0, 3, 6), 1.0), second])
+    for item in stitcher.take():
+        assert rotation_angle(item.world_from_camera[:3, :3]) < 0.01
+
+
+def test_windows_that_do_not_fit_together_leave_no_trace() -> None:
+    stitcher = Stitcher(SETTINGS)
+    stitcher.add(window_of((0, 1, 2), 1.0))
+    wrong = window_of((1, 3, 5), 1.0)
+    wrong[0].world_from_camera[:3, :3] = np.diag([-1.0, 1, -1])
+    wrong[2].world_from_camera[:3, :3] = np.diag([1.0, -1, -1])
+    assert not stitcher.weave([window_of((1, 2, 5), 1.0), wrong])
+    assert [item.index for item in stitcher.take()] == [0, 1, 2]
+    assert stitcher.warnings == []
 
 
 def test_a_failed_alignment_begins_a_segment_and_says_so() -> None:
-    stitcher = Stitcher(2, SETTINGS)
-    out = list(stitcher.add([frame(i, 1.0) for i in range(4)], shared=0))
+    stitcher = Stitcher(SETTINGS)
+    stitcher.add([frame(i, 1.0) for i in range(4)])
+    out = stitcher.take(2)
     turned = [frame(i, 1.0, x=5.0 + i) for i in range(2, 6)]
     turned[1].world_from_camera[:3, :3] = np.diag([-1.0, 1, -1])
-    out += stitcher.add(turned, shared=2)
-    out += stitcher.finish()
+    stitcher.add(turned)
+    out += stitcher.take()
     assert [item.index for item in out] == list(range(6))
     assert [item.segment for item in out] == [0, 0, 0, 0, 1, 1]
     np.testing.assert_array_equal(out[4].world_from_camera, np.eye(4))
@@ -182,10 +202,23 @@ def test_a_failed_alignment_begins_a_segment_and_says_so() -> None:
     assert "frames from 4 on" in stitcher.warnings[0]
 
 
+def test_a_cut_begins_a_segment_and_says_so() -> None:
+    stitcher = Stitcher(SETTINGS)
+    stitcher.cut(0)
+    assert stitcher.weave([window_of((0, 2, 4), 1.0), window_of((0, 1, 3, 4), 2.0)])
+    stitcher.cut(5)
+    stitcher.add(window_of((5, 6), 9.0))
+    out = stitcher.take()
+    assert [item.segment for item in out] == [0] * 5 + [1] * 2
+    np.testing.assert_array_equal(out[5].world_from_camera, np.eye(4))
+    assert stitcher.warnings == ["a cut at frame 5: what follows has a world and scale of its own"]
+
+
 def test_frames_given_out_are_never_changed_by_a_window_that_was_moved_back() -> None:
-    stitcher = Stitcher(2, SETTINGS)
-    out = list(stitcher.add([frame(i, 1.0) for i in range(6)], shared=0))
+    stitcher = Stitcher(SETTINGS)
+    stitcher.add([frame(i, 1.0) for i in range(6)])
+    out = stitcher.take(4)
     assert [item.index for item in out] == [0, 1, 2, 3]
-    out += stitcher.add([frame(i, 1.0) for i in range(1, 7)], shared=5)
-    out += stitcher.finish()
+    stitcher.add([frame(i, 1.0) for i in range(1, 7)])
+    out += stitcher.take()
     assert [item.index for item in out] == list(range(7))

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +20,7 @@ from bathyscope.errors import DatasetError
 from bathyscope.vision.cuts import CutDetector
 from bathyscope.vision.field_of_view import DARK, FieldOfView, find_field_of_view
 from bathyscope.vision.grid import Grid, choose_size
+from bathyscope.vision.motion import MotionMeter
 from bathyscope_train.data.clip_pictures import to_model_quickly
 from bathyscope_train.data.datasets.sequence import DataSequence, Image
 from bathyscope_train.data.survey_files import (
@@ -120,7 +120,7 @@ class _Walk:
         self._still = 0
         self._grid, self._settings = grid, settings
         self._cuts = CutDetector(settings.cuts, grid.inside)
-        self._flow = MotionMeter(grid)
+        self._flow = MotionMeter(grid.inside)
 
     def see(self, index: int, image: Image) -> None:
         """Judge the next frame."""
@@ -151,32 +151,6 @@ class _Walk:
         if self._still:
             found.append(f"{self._still} frames show nothing new and are left out")
         return found
-
-
-class MotionMeter:
-    """Median length of dense optical flow inside the field of view, as a share of the picture's width."""
-
-    def __init__(self, grid: Grid) -> None:
-        import cv2
-
-        self._inside = grid.inside
-        self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
-        self._before: NDArray[np.uint8] | None = None
-
-    def keep(self, small: NDArray[np.float32]) -> None:
-        """Measure from this picture (3, h, w) from now on."""
-        self._before = _grey(small)
-
-    def since(self, small: NDArray[np.float32]) -> float:
-        """Motion from the picture that was kept last to this one."""
-        assert self._before is not None
-        now = _grey(small)
-        flow: Any = self._flow.calc(self._before, now, np.zeros((*now.shape, 2), np.float32))
-        return float(np.median(np.hypot(flow[..., 0], flow[..., 1])[self._inside]) / small.shape[2])
-
-
-def _grey(small: NDArray[np.float32]) -> NDArray[np.uint8]:
-    return np.ascontiguousarray(np.rint(small.mean(0) * 255).clip(0, 255).astype(np.uint8))
 
 
 def _readable(sequence: DataSequence, walk: _Walk) -> Iterator[tuple[int, Image]]:
