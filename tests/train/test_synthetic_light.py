@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from bathyscope_train.data.synthetic import DOMAINS
+from bathyscope_train.data.synthetic import DOMAINS, render_clip
 from bathyscope_train.data.synthetic.domain import LightRanges, MaterialRanges, Palette
 from bathyscope_train.data.synthetic.films import Patch, coat_surface
 from bathyscope_train.data.synthetic.kernels import render
@@ -171,6 +171,17 @@ def test_the_held_out_domain_lies_outside_what_training_sees() -> None:
         ]
         assert any(apart)
     assert broad.spots[1] <= shifted.spots[0]
+
+
+def test_light_without_red_is_what_the_narrowband_domain_adds() -> None:
+    narrow, shifted, broad = (DOMAINS[name] for name in ("narrowband", "shifted", "broad"))
+    assert (narrow.material, narrow.light, narrow.camera) == (shifted.material, shifted.light, shifted.camera)
+    assert narrow.sensor.tinted == 1
+    assert narrow.sensor.warmth[1] < broad.sensor.warmth[0]
+    clip = render_clip(0, narrow, frames=1, size=(28, 36))
+    red, green, blue = clip.frames[0][clip.valid[0]].mean(0)
+    assert red < 0.8 * green
+    assert red < 0.8 * blue
 
 
 def test_the_typical_domain_lies_within_the_broad_one() -> None:

@@ -9,6 +9,7 @@ Each is a file beside this module, in the format of ``Domain.from_file``:
   farthest thing in a picture is ten to thirty times as far as the nearest.
 * ``broad``: wide ranges of everything, the far ends included: narrow and fish-eye views, strong haze, paint and smear.
 * ``shifted``: never trained on; pale and yellowish, spotted, slow fall-off, narrow beam, strong highlights.
+* ``narrowband``: never trained on; the same in light without red, as in narrow-band imaging.
 """
 
 from collections.abc import Iterator, Mapping
@@ -18,7 +19,7 @@ from pathlib import Path
 from bathyscope_train.data.synthetic.domain import Domain
 
 _FOLDER = Path(__file__).with_name("domains")
-_NAMES = ("source", "typical", "tubes", "broad", "shifted")
+_NAMES = ("source", "typical", "tubes", "broad", "shifted", "narrowband")
 
 
 class NamedDomains(Mapping[str, Domain]):
