@@ -14,7 +14,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.camera import invert_pose
+from bathyscope.camera import Size, invert_pose
 from bathyscope.gaussians import Gaussians, concatenate
 from bathyscope.model_spec import SceneSpec
 from bathyscope.result import DepthKind
@@ -70,13 +70,14 @@ class Views:
         """Frames that can be rendered now that these have come, too."""
         if self._kind == "head":
             return frames
+        if self._spec.activation != "footprint":
+            return list(self._run(self._of_window, frames))
         ready = []
         for frame in frames:
             if self._held and self._held[-1].segment != frame.segment:
                 ready += self.finish()
             self._held.append(frame)
-            if isinstance(frame.scene, FrameScene):
-                self._gaussians[frame.index] = self._own_gaussians(frame, frame.scene)
+            self._gaussians[frame.index] = self._own_gaussians(frame)
         return ready + self._render(self._ready())
 
     def finish(self) -> list[PlacedFrame]:
@@ -105,11 +106,23 @@ class Views:
         past = [frame for frame in past if frame.key][-self._keys - self._near :]
         self._held = [*past, *recent, *self._held[end:]]
         self._next = len(past) + len(recent)
-        self._gaussians = {frame.index: self._gaussians[frame.index] for frame in self._held if self._gaussians}
+        self._gaussians = {frame.index: self._gaussians[frame.index] for frame in self._held}
 
     def _view(self, place: int) -> PlacedFrame:
+        """A frame as the Gaussians of the frames around it show it."""
         frame = self._held[place]
-        picture, scale = self._picture(place)
+        around = concatenate([self._gaussians[self._held[other].index] for other in self._around(place)])
+        camera = invert_pose(frame.world_from_camera)
+        return self._shown(frame, render(around, camera, frame.intrinsics, _size(frame), colour=False))
+
+    def _of_window(self, frame: PlacedFrame) -> PlacedFrame:
+        """A frame as the Gaussians of its window show it."""
+        assert isinstance(frame.scene, WindowScene)
+        window = frame.scene
+        picture = render(window.gaussians, window.camera_from_window, frame.intrinsics, _size(frame), colour=False)
+        return self._shown(frame, picture, np.float32(window.scale))
+
+    def _shown(self, frame: PlacedFrame, picture: Rendering, scale: np.float32 = np.float32(1)) -> PlacedFrame:
         depth, accumulated = picture.depth * scale, picture.accumulated * scale
         share = np.minimum(picture.opacity / max(self._least_opacity, 1e-6), 1).astype(np.float32)
         solid = (picture.opacity >= self._least_opacity) & (depth > 0)
@@ -122,18 +135,6 @@ class Views:
             scene=None,
         )
 
-    def _picture(self, place: int) -> tuple[Rendering, np.float32]:
-        """What the frame's camera sees, and the factor to the unit of the result."""
-        frame = self._held[place]
-        size = (frame.depth.shape[0], frame.depth.shape[1])
-        if isinstance(frame.scene, WindowScene):
-            window = frame.scene
-            picture = render(window.gaussians, window.camera_from_window, frame.intrinsics, size, colour=False)
-            return picture, np.float32(window.scale)
-        around = concatenate([self._gaussians[self._held[other].index] for other in self._around(place)])
-        camera = invert_pose(frame.world_from_camera)
-        return render(around, camera, frame.intrinsics, size, colour=False), np.float32(1)
-
     def _around(self, place: int) -> list[int]:
         """Places of the frames whose Gaussians show this one; as many keys before it as after, if there are."""
         nearest = sorted(range(len(self._held)), key=lambda other: (abs(other - place), other))
@@ -144,6 +145,11 @@ class Views:
         rest = [other for other in [*keys, *others] if other not in both]
         return sorted({*near, *[*both, *dict.fromkeys(rest)][: self._keys]})
 
-    def _own_gaussians(self, frame: PlacedFrame, scene: FrameScene) -> Gaussians:
+    def _own_gaussians(self, frame: PlacedFrame) -> Gaussians:
+        assert isinstance(frame.scene, FrameScene)
         camera = Cameras(frame.world_from_camera[None], frame.intrinsics[None])
-        return frame_gaussians(scene.raw, frame.depth, scene.image, camera, self._spec, inside=self._inside)
+        return frame_gaussians(frame.scene.raw, frame.depth, frame.scene.image, camera, self._spec, inside=self._inside)
+
+
+def _size(frame: PlacedFrame) -> Size:
+    return frame.depth.shape[0], frame.depth.shape[1]

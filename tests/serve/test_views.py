@@ -7,8 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bathyscope.camera import Similarity
 from bathyscope.model_spec import SceneSpec
-from bathyscope_serve.placed import FrameScene, PlacedFrame
+from bathyscope.scene import Cameras, frame_gaussians
+from bathyscope.splat import prepare
+from bathyscope_serve.placed import FrameScene, PlacedFrame, WindowScene
 from bathyscope_serve.views import Views
 
 SIZE = (14, 16)
@@ -87,3 +90,17 @@ def test_accumulated_depth_is_left_thin() -> None:
 def test_head_depth_goes_through_as_it_is() -> None:
     frames = [replace(wall(i, 1.0 + i), scene=None) for i in range(4)]
     assert Views(SPEC, inside=EVERYWHERE, depth="head").add(frames) == frames
+
+
+def test_fused_gaussians_are_seen_from_their_own_window_in_the_unit_of_the_result() -> None:
+    """The window's wall is at 1; its world grows twice, then three times, and turns, on the way to the result."""
+    own = wall(4)
+    assert isinstance(own.scene, FrameScene)
+    camera = Cameras(own.world_from_camera[None], own.intrinsics[None])
+    gaussians = frame_gaussians(own.scene.raw, own.depth, own.scene.image, camera, SPEC, inside=EVERYWHERE)
+    placed = replace(own, scene=WindowScene(prepare(gaussians), np.eye(4)))
+    for scale in (2.0, 3.0):
+        placed = placed.moved(Similarity(scale, np.diag([-1.0, -1, 1]), np.array([1.0, 2, 3])), 0)
+    fused = SPEC.model_copy(update={"activation": "anysplat"})
+    (seen,) = Views(fused, inside=EVERYWHERE).add([placed])
+    np.testing.assert_allclose(seen.depth, 6.0, rtol=1e-4)
