@@ -41,8 +41,10 @@ def align(target: SharedFrames, source: SharedFrames, settings: StitchSettings) 
     means over the shared cameras.
     """
     both = target.known & source.known
-    if both.mean() < settings.least_share:
-        return Misfit(f"only {both.mean():.1%} of the shared pixels have depth in both windows")
+    measured = target.known.any(axis=(1, 2))  # the others hold cameras only
+    share = float(both[measured].mean()) if measured.any() else 0.0
+    if share < settings.least_share:
+        return Misfit(f"only {share:.1%} of the shared pixels have depth in both windows")
     ratios = np.log(target.depth[both].astype(np.float64) / source.depth[both])
     middle = float(np.median(ratios))
     spread = float(np.median(np.abs(ratios - middle)))

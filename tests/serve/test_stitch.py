@@ -87,6 +87,16 @@ def test_frames_without_common_pixels_are_no_alignment() -> None:
     assert isinstance(align(empty, source, SETTINGS), Misfit)
 
 
+def test_frames_that_hold_cameras_only_do_not_lower_the_share_of_pixels_with_depth() -> None:
+    """7 % of the pixels of two frames: enough for a scale, however many cameras stand beside them."""
+    rng = np.random.default_rng(4)
+    source = random_frames(rng, 8)
+    known = np.zeros_like(source.known)
+    known[:2, 0, :5] = True
+    truth = Similarity(2.0, random_rotation(rng), rng.normal(size=3))
+    assert_same(align(replace(carried(source, truth), known=known), source, SETTINGS), truth)
+
+
 def test_half_way_between_two_poses_is_half_the_turn_and_half_the_way() -> None:
     rng = np.random.default_rng(2)
     first, second = np.eye(4), np.eye(4)
