@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Self
 
-from pydantic import BaseModel, Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import BaseModel, Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from bathyscope.vision.cuts import CutSettings
 from bathyscope_serve.decode_limits import DecodeLimits
@@ -34,6 +34,23 @@ class PaceSettings(BaseModel, frozen=True, extra="forbid"):
     )
 
 
+class TrackSettings(BaseModel, frozen=True, extra="forbid"):
+    """How points are followed through the video."""
+
+    points: NonNegativeInt = Field(
+        default=500, description="Points in a frame; 0 leaves cameras and depth as they are."
+    )
+    pixels: PositiveInt = Field(default=180_000, description="Largest area of the pictures that they are followed in.")
+
+
+class RefineSettings(BaseModel, frozen=True, extra="forbid"):
+    """How many key frames are adjusted together."""
+
+    step: PositiveInt = Field(default=4, description="New key frames after which there is an adjustment.")
+    wait: PositiveInt = Field(default=4, description="Key frames that are adjusted again before they are given out.")
+    past: PositiveInt = Field(default=12, description="Key frames before them that hold the world in place.")
+
+
 class EngineSettings(BaseModel, frozen=True, extra="forbid"):
     """How clips are run through a bundle."""
 
@@ -48,6 +65,8 @@ class EngineSettings(BaseModel, frozen=True, extra="forbid"):
     )
     pace: PaceSettings = PaceSettings()
     stitch: StitchSettings = StitchSettings()
+    tracks: TrackSettings = TrackSettings()
+    refine: RefineSettings = RefineSettings()
     cuts: CutSettings = CutSettings()
     decode: DecodeLimits = DecodeLimits()
 

@@ -14,6 +14,18 @@ F32 = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
+class Sight:
+    """Where points that are followed through the video are in one frame."""
+
+    ids: NDArray[np.int64]
+    """(n,) rising; a number is never used twice."""
+    places: F32
+    """(n, 2) u and v in pixels of the network's image."""
+    pixel: float
+    """Pixels of the network's image that a pixel of the followed picture covers."""
+
+
+@dataclass(frozen=True, slots=True)
 class FrameScene:
     """What the Gaussians of one frame are made of, wherever it is placed: one for each pixel."""
 
@@ -54,6 +66,8 @@ class PlacedFrame:
     key: bool = True
     """Whether it is far enough from the key frame before to be compared with it."""
     scene: FrameScene | WindowScene | None = None
+    sight: Sight | None = None
+    """Where the followed points are, if any are followed."""
     segment: int = 0
 
     def moved(self, motion: Similarity, segment: int) -> PlacedFrame:

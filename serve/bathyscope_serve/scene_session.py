@@ -21,7 +21,9 @@ from bathyscope.vision.grid import Grid
 from bathyscope_serve.blocks import Block, cut_blocks
 from bathyscope_serve.frames import FrameSource, SequenceSource
 from bathyscope_serve.pace import paced
-from bathyscope_serve.placed import FrameScene, PlacedFrame, WindowScene
+from bathyscope_serve.placed import FrameScene, PlacedFrame, Sight, WindowScene
+from bathyscope_serve.refine.refiner import Refiner
+from bathyscope_serve.refine.tracks import PointTracker
 from bathyscope_serve.session import DepthSession, Job, SmallFrame
 from bathyscope_serve.stitch import Stitcher
 from bathyscope_serve.views import Map, Views
@@ -46,15 +48,32 @@ class SceneSession(DepthSession):
         self._depth_kind = _depth_kind(job, scene)
         super().__init__(job, ResultMeta(depth=self._depth_kind))
         self._model, self._scene, self._renderers = model, scene, renderers
+        fused = self._depth_kind != "head" and scene.activation != "footprint"  # cannot be moved frame by frame
+        self._follows = job.settings.tracks.points > 0 and not fused
 
     def _estimates(self, source: FrameSource, field_of_view: FieldOfView) -> Iterator[FrameDepth]:
         grid = Grid.fit(field_of_view, self._job.input)
         stitcher = Stitcher(self._job.settings.stitch)
         try:
-            for small in self._rendered(self._placed(source, grid, stitcher), grid):
+            placed = self._refined(self._placed(source, grid, stitcher))
+            for small in self._rendered(placed, grid):
                 yield self._result(small, grid)
         finally:
             self._warnings.extend(stitcher.warnings)
+
+    def _refined(self, placed: Iterable[list[PlacedFrame]]) -> Iterator[list[PlacedFrame]]:
+        """The frames with cameras and depth that agree with the points that were followed."""
+        if not self._follows:
+            yield from placed
+            return
+        refiner = Refiner(self._job.settings.refine)
+        for frames in placed:
+            with self._timed("refine"):
+                ready = refiner.add(frames)
+            yield ready
+        with self._timed("refine"):
+            ready = refiner.finish()
+        yield ready
 
     def _rendered(self, placed: Iterable[list[PlacedFrame]], grid: Grid) -> Iterator[PlacedFrame]:
         """The frames with the depth that was asked for."""
@@ -84,8 +103,16 @@ class SceneSession(DepthSession):
     def _placed(self, source: FrameSource, grid: Grid, stitcher: Stitcher) -> Iterator[list[PlacedFrame]]:
         """Frames in the world of their segment, as their places become final; the last list is of all that is left."""
         wanted = self._job.input
-        frames = paced(self._frames(source, grid.to_model, grid.inside), self._job.settings.pace, grid.inside)
-        for block in cut_blocks(frames, wanted.window, wanted.overlap):
+        tracker = PointTracker(grid, self._job.settings.tracks)
+
+        def watch(image: NDArray[np.uint8], cut: bool) -> Sight | None:
+            if cut:
+                tracker.forget()
+            return tracker.sight(image) if self._follows else None
+
+        frames = self._frames(source, grid.to_model, grid.inside, watch)
+        keyed = paced(frames, self._job.settings.pace, grid.inside)
+        for block in cut_blocks(keyed, wanted.window, wanted.overlap):
             if block.shared == 0:
                 stitcher.cut(block.items[0].index)
             self._place(block, grid, stitcher)
@@ -131,6 +158,7 @@ class SceneSession(DepthSession):
                 intrinsics=cameras.intrinsics[k],
                 key=places[k] in keys,
                 scene=scene,
+                sight=frame.sight,
             )
             for k, (frame, scene) in enumerate(zip(window, self._scenes(maps, images, grid), strict=True))
         ]

@@ -7,7 +7,7 @@ import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO, cast
@@ -25,8 +25,13 @@ from bathyscope.vision.field_of_view import FieldOfView, Mask, find_field_of_vie
 from bathyscope_serve.engine_settings import EngineSettings
 from bathyscope_serve.frames import FrameSource, SequenceSource
 from bathyscope_serve.isolation import open_source
+from bathyscope_serve.placed import Sight
 
 Source = Path | str | BinaryIO | FrameSequence | FrameSource
+
+
+def _unwatched(image: NDArray[np.uint8], cut: bool) -> None:
+    """No points are followed."""
 
 
 class StoppedError(BathyscopeError):
@@ -41,6 +46,8 @@ class SmallFrame:
     timestamp_s: float
     image: NDArray[np.float32]
     """(3, h, w) RGB in [0, 1], or a little beyond where it was resized bicubically."""
+    sight: Sight | None = None
+    """Where the followed points are, if any are followed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +127,11 @@ class DepthSession(ABC):
             return open_source(source, name=self._name, limits=self._job.settings.decode)
 
     def _frames(
-        self, source: FrameSource, prepare: Callable[[NDArray[np.uint8]], NDArray[np.float32]], inside: Mask
+        self,
+        source: FrameSource,
+        prepare: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
+        inside: Mask,
+        watch: Callable[[NDArray[np.uint8], bool], Sight | None] = _unwatched,
     ) -> Iterator[tuple[SmallFrame, bool]]:
         """Frames for the network, each with whether it begins a shot.
 
@@ -128,6 +139,7 @@ class DepthSession(ABC):
             source: Where they come from.
             prepare: A frame (H, W, 3) to what the network sees (3, h, w).
             inside: (h, w) where it shows something.
+            watch: A frame (H, W, 3), and whether it begins a shot, to the points that are followed.
         """
         cuts = CutDetector(self._job.settings.cuts, inside)
         stride, most = self._job.options.stride, self._job.options.max_frames
@@ -139,8 +151,10 @@ class DepthSession(ABC):
                     return
                 small = SmallFrame(frame.index, frame.timestamp_s, prepare(frame.image))
                 cut = cuts.is_cut(np.clip(small.image, 0, 1))  # bicubic resizing overshoots
+            with self._timed("track"):
+                sight = watch(frame.image, cut)
             self._checkpoint()
-            yield small, cut
+            yield replace(small, sight=sight), cut
 
     def _checkpoint(self) -> None:
         if self._closed:

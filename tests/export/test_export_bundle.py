@@ -5,7 +5,7 @@ from __future__ import annotations
 import fcntl
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -246,6 +246,15 @@ def test_a_difference_beyond_rounding_stops_the_export() -> None:
         wrong = Difference(**(fine.record() | {name: value}))
         with pytest.raises(BundleError, match=rf"2 frames of 28x28: {name} "):
             wrong.check()
+
+
+def test_a_network_whose_own_depth_moves_with_the_last_bit_is_given_as_much_room() -> None:
+    rough = Difference(2, 28, 28, 2e-4, 0, 0, 0, 0, 0, rounding=7e-5)
+    rough.check()
+    with pytest.raises(BundleError, match=r"depth 2\.0e-04 \(at most 1\.8e-04"):
+        replace(rough, rounding=6e-5).check()
+    with pytest.raises(BundleError, match="rotation"):
+        replace(rough, rotation=2e-5).check()
 
 
 def test_decomposed_attention_is_refused() -> None:
