@@ -23,6 +23,7 @@ U8 = NDArray[np.uint8]
 
 _WINDOW = 13  # pixels; larger ones straddle steps of depth
 _LEVELS = 4
+_ENOUGH = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 15, 0.02)
 _RETURN = 0.6  # pixels by which a point followed there and back may miss
 _BRIGHT = 200  # least channel of a highlight
 _SPACING = 9
@@ -81,7 +82,9 @@ class PointTracker:
 
     def _usable(self, picture: U8) -> U8:
         """255 where there may be points."""
-        bright = cv2.dilate((picture.min(2) > _BRIGHT).astype(np.uint8), np.ones((9, 9), np.uint8))
+        red, green, blue = cv2.split(picture)
+        _, bright = cv2.threshold(cv2.min(cv2.min(red, green), blue), _BRIGHT, 255, cv2.THRESH_BINARY)
+        bright = cv2.dilate(bright, np.ones((9, 9), np.uint8))
         return np.where((self._inside > 0) & (bright == 0), np.uint8(255), np.uint8(0))
 
     def _follow(self, before: U8, now: U8, usable: U8) -> None:
@@ -126,5 +129,6 @@ def _flow(source: U8, target: U8, points: F32) -> tuple[F32, NDArray[np.bool_]]:
         np.zeros_like(points),
         winSize=(_WINDOW, _WINDOW),
         maxLevel=_LEVELS,
+        criteria=_ENOUGH,
     )
     return np.asarray(moved, np.float32).reshape(-1, 2), np.asarray(status).ravel() == 1
