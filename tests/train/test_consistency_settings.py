@@ -108,7 +108,7 @@ def test_an_experiment_hands_overrides_to_its_runs() -> None:
     run = settings.run_settings("rgb + temp", 1)
     assert (run.loss.world.weight, run.loss.world.delta, run.seed) == (0, 0.2, 1)
     assert run.out.name == "rgb-+-temp-seed1"
-    assert settings.run_settings("all", 0).loss.world.weight == 5
+    assert settings.run_settings("all", 0).loss.world.weight == 1
 
 
 def test_the_stability_experiment_is_five_runs_of_one_clip_a_step() -> None:

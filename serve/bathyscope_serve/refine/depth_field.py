@@ -20,7 +20,7 @@ F32 = NDArray[np.float32]
 _GRID = np.linspace(-0.9, 0.9, 6)
 _WIDTH = 0.8 * (_GRID[1] - _GRID[0])
 _PLAIN = 4
-_SPREAD = np.concatenate([[1.0, 0.1, 0.1, 0.03], np.full(_GRID.size**2, 0.1)])
+_SPREAD = np.concatenate([[1.0, 0.1, 0.1, 0.03], np.full(_GRID.size**2, 0.06)])
 """Standard deviations before anything is known; of a around that of the frame before, of the others around 0."""
 _KEPT = np.concatenate([[1.0], np.full(len(_SPREAD) - 1, 0.8)])
 """How much of a frame's values is left in the next if that has no points."""
