@@ -50,7 +50,7 @@ class DepthEngine:
         self.renderers = ThreadPoolExecutor(self.settings.render_threads, thread_name_prefix="splat")
 
     def warm_up(self) -> None:
-        """Run a short made-up clip through everything, compiling the splatter on the way.
+        """Run a short made-up clip through everything, compiling the splatter and the adjustment on the way.
 
         A video network is only run on two small frames: it compiles nothing, and a window of its own size may take
         minutes.
@@ -59,8 +59,10 @@ class DepthEngine:
             side = _WARM_UP_PATCHES * self.input.patch
             cast(VideoModel, self.model).values(np.full((2, 3, side, side), 0.5, np.float32))
             return
-        noise = np.random.default_rng(0).integers(0, 255, (2, 64, 80, 3)).astype(np.uint8)
-        self.depth_of(Clip(noise, np.array([0.0, 0.04]), "warm-up"))
+        noise = np.random.default_rng(0).integers(0, 200, (64, 80, 3)).astype(np.uint8)
+        self.depth_of(
+            Clip(np.stack([noise, noise]), np.array([0.0, 0.04]), "warm-up")
+        )  # a still: points are found again
 
     def run(self, source: Source, options: DepthOptions | None = None, *, name: str | None = None) -> DepthSession:
         """Begin with a video, a zip or folder of images, an open file, or frames that are read as they are needed.

@@ -11,6 +11,8 @@ from bathyscope.bundle import Bundle, shipped_bundle
 from bathyscope.camera import rotation_angle
 from bathyscope.engines import DepthOptions
 from bathyscope_serve.engine import DepthEngine
+from bathyscope_serve.refine import problem
+from bathyscope_serve.refine.adjustment import adjust
 
 
 @pytest.fixture(scope="module")
@@ -47,3 +49,10 @@ def test_the_lumen_of_the_demo_clip_is_far_and_its_wall_near(bundle: Bundle) -> 
     assert np.median(middle.max((1, 2))) > 2 * np.median(edge)
     np.testing.assert_array_equal(result.world_from_camera[0], np.eye(4))
     assert np.degrees(rotation_angle(result.world_from_camera[-1, :3, :3])) < 45
+
+
+def test_warming_up_compiles_the_adjustment_too(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:
+    adjusted = []
+    monkeypatch.setattr(problem, "adjust", lambda *given: adjusted.append(given) or adjust(*given))
+    DepthEngine(bundle).warm_up()
+    assert adjusted
