@@ -46,7 +46,7 @@ def _step(camera: F64, points: F64, rays: F64, focal: F64) -> F64:
     slope = np.concatenate([by_place @ cross, by_place], 2).reshape(-1, 6)
     weight = np.repeat(1 / (1 + (off.reshape(-1, 2) ** 2).sum(1) / LOOSE), 2)
     square = slope.T @ (slope * weight[:, None])
-    change = -np.linalg.solve(square + 1e-9 * np.trace(square) * np.eye(6), slope.T @ (weight * off))
+    change = -np.linalg.solve(square + (1e-9 * np.trace(square) + 1e-12) * np.eye(6), slope.T @ (weight * off))
     turn = rotations(change[None, :3])[0]
     moved = np.eye(4)
     moved[:3, :3] = turn @ camera[:3, :3]
