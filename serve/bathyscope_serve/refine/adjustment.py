@@ -66,11 +66,15 @@ class State:
 
     def misses(self, sights: Sights) -> F64:
         """Distances (m,) in pixels between where points are seen and where they should be; infinite behind a camera."""
-        seen = self.seen(sights)
-        ahead = seen[:, 2] > 0
-        depth = np.where(ahead, seen[:, 2], 1.0)
-        off = seen[:, :2] / depth[:, None] - sights.numbers[:, :2]
-        return np.where(ahead, sights.numbers[:, 2] * np.linalg.norm(off, axis=1), np.inf)
+        return misses(self.seen(sights), sights.numbers)
+
+
+def misses(seen: F64, numbers: F64) -> F64:
+    """Distances (m,) in pixels of points (m, 3) in a camera from their sights (m, 4); infinite behind it."""
+    ahead = seen[:, 2] > 0
+    depth = np.where(ahead, seen[:, 2], 1.0)
+    off = seen[:, :2] / depth[:, None] - numbers[:, :2]
+    return np.where(ahead, numbers[:, 2] * np.linalg.norm(off, axis=1), np.inf)
 
 
 def adjust(sights: Sights, state: State, free: NDArray[np.bool_]) -> State:

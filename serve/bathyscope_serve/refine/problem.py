@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from bathyscope.camera import F64, invert_pose
 from bathyscope_serve.alignment import blend_poses
-from bathyscope_serve.refine.adjustment import Sights, State, adjust, uncertainty
+from bathyscope_serve.refine.adjustment import Sights, State, adjust, misses, uncertainty
 from bathyscope_serve.refine.depth_field import DepthField, KnownDepths, fit_field
 from bathyscope_serve.refine.resection import resect
 from bathyscope_serve.refine.tracked_frame import TrackedFrame, carry
@@ -98,11 +98,9 @@ class Problem:
         camera = view.camera_from_world
         local = points @ camera[:3, :3].T + camera[:3, 3]
         numbers = view.numbers[seen]
-        z = np.maximum(local[:, 2], 1e-9)
-        off = numbers[:, 2] * np.linalg.norm(local[:, :2] / z[:, None] - numbers[:, :2], axis=1)
-        good = (local[:, 2] > 0) & (off < _MISSED) & (doubt < _DOUBTFUL) & np.isfinite(numbers[:, 3])
+        good = (misses(local, numbers) < _MISSED) & (doubt < _DOUBTFUL) & np.isfinite(numbers[:, 3])
         size = view.frame.depth.shape[0], view.frame.depth.shape[1]
-        shown = KnownDepths(view.places[seen][good], numbers[good, 3], np.log(z[good]), doubt[good])
+        shown = KnownDepths(view.places[seen][good], numbers[good, 3], np.log(local[good, 2]), doubt[good])
         return fit_field(shown, size, before)
 
     def _met(self, view: TrackedFrame) -> tuple[I64, F64, F64]:
