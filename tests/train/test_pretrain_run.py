@@ -1,6 +1,7 @@
 """A pre-training run: what it learns from nothing in a minute, that it repeats, resumes and refuses."""
 
 import json
+import tempfile
 from pathlib import Path
 from unittest.mock import DEFAULT, Mock
 
@@ -139,10 +140,17 @@ def test_a_run_can_change_how_far_small_motions_are_held_back(clips: Path, tmp_p
     assert after == before.model_copy(update={"camera": before.camera.model_copy(update={"flow_noise": 0.25})})
 
 
-def test_what_is_wrong_in_a_worker_is_told_as_if_there_were_one(clips: Path, tmp_path: Path) -> None:
+def test_what_is_wrong_in_a_worker_is_told_as_if_there_were_one(
+    clips: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By one line; the folder where the workers met is gone afterwards."""
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     chosen = settings(clips, tmp_path, preset="tiny-lite0", encoder=tmp_path / "none.pth", workers=2, batch=2)
     with pytest.raises(CheckpointError, match=r"^[^\n]*none.pth: cannot be read[^\n]*$"):
         pretrain(chosen)
+    assert not list(temporary.glob("bathyscope-*"))
 
 
 def test_a_damaged_state_is_refused_by_name(clips: Path, tmp_path: Path) -> None:

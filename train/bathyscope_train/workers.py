@@ -8,7 +8,7 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 
 import torch
 import torch.distributed as dist
@@ -40,14 +40,15 @@ def launch(work: Callable[[int], None], workers: int) -> None:
     else:
         from torch.multiprocessing.spawn import ProcessExitedException, spawn
 
-        folder = Path(mkdtemp(prefix="bathyscope-train-"))
-        try:
-            spawn(_join, args=(folder, workers, work), nprocs=workers)
-        except ProcessExitedException:
-            for file in folder.glob(_TOLD.format(rank="*")):
-                kind, message = json.loads(file.read_text(encoding="utf-8"))
-                raise getattr(errors, kind)(message) from None
-            raise
+        with TemporaryDirectory(prefix="bathyscope-train-") as made:
+            folder = Path(made)
+            try:
+                spawn(_join, args=(folder, workers, work), nprocs=workers)
+            except ProcessExitedException:
+                for file in folder.glob(_TOLD.format(rank="*")):
+                    kind, message = json.loads(file.read_text(encoding="utf-8"))
+                    raise getattr(errors, kind)(message) from None
+                raise
 
 
 def share_gradients(parameters: Sequence[nn.Parameter], progress: float) -> float:
