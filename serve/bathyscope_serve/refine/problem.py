@@ -80,11 +80,14 @@ class Problem:
             self._keys[number].world_from_camera = invert_pose(pose)
 
     def between(self, view: TrackedFrame, before: TrackedFrame | None, after: TrackedFrame | None) -> F64:
-        """The camera of a frame that is none of the key frames: between those around it, then by the points."""
+        """The camera of a frame that is none of the key frames: between those around it, then by the points.
+
+        Of a frame that shows nothing the network cannot know where it is: it is taken to lie on the way.
+        """
         ends = [end for end in (before, after) if end is not None]
         if not ends:
             return view.world_from_camera
-        carried = [carry(view.frame, end) for end in ends]
+        carried = [carry(view.frame, end) if view.shows else end.world_from_camera for end in ends]
         if len(ends) == 2:
             first, last = (end.frame.index for end in ends)
             carried[0] = blend_poses(carried[0], carried[1], (view.frame.index - first) / (last - first))

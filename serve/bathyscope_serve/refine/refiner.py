@@ -63,7 +63,7 @@ class Refiner:
 
     def _carried(self, frame: PlacedFrame) -> tuple[F64, DepthField]:
         """Camera and depth in the refined world, by the key frame before."""
-        keys = [view for view in [*self._fixed, *self._open] if view.frame.key and view.settled]
+        keys = [view for view in [*self._fixed, *self._open] if view.frame.key and view.shows and view.settled]
         if not keys:
             return frame.world_from_camera, plain_field(1.0)
         return carry(frame, keys[-1]), plain_field(keys[-1].field.scale)
@@ -91,10 +91,11 @@ class Refiner:
         before: TrackedFrame | None = self._fixed[-1] if self._fixed else None
         field = before.field if before is not None else plain_field(1.0)
         for number, view in enumerate(self._open):
-            if view.frame.key:
+            if view.frame.key and view.shows:
                 before = view
             else:
-                after = next((other for other in self._open[number:] if other.frame.key), None)
+                later = self._open[number + 1 :]
+                after = next((other for other in later if other.frame.key and other.shows), None)
                 view.world_from_camera = problem.between(view, before, after)
             field = view.field = problem.field(view, field)
             view.settled = True

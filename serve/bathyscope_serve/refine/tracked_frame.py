@@ -32,6 +32,11 @@ class TrackedFrame:
     """Whether it has been adjusted once."""
 
     @property
+    def shows(self) -> bool:
+        """Whether there is anything in the frame that could be followed."""
+        return len(self.ids) > 0
+
+    @property
     def camera_from_world(self) -> F64:
         return invert_pose(self.world_from_camera)
 

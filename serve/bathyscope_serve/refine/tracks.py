@@ -2,11 +2,13 @@
 
 Corners are followed by pyramidal Lucas-Kanade in pictures whose contrast is evened out, since the light travels with
 the camera. A point is given up where following it back does not end where it began, at highlights, which do not stay
-with the tissue, and at the border of the field of view.
+with the tissue, and at the border of the field of view. Where most are lost at once, by a frame that is blurred or
+covered, they are looked for again in the frames after it.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -19,6 +21,7 @@ from bathyscope_serve.engine_settings import TrackSettings
 from bathyscope_serve.placed import Sight
 
 F32 = NDArray[np.float32]
+I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 
 _WINDOW = 13  # pixels; larger ones straddle steps of depth
@@ -26,10 +29,23 @@ _LEVELS = 4
 _ENOUGH = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 15, 0.02)
 _RETURN = 0.6  # pixels by which a point followed there and back may miss
 _BRIGHT = 200  # least channel of a highlight
+_BLACK = 8  # largest channel of what shows nothing but noise
 _SPACING = 9
 _QUALITY = 0.003
 _LEAST_PIXELS = 60_000  # smaller pictures are enlarged: windows must not hold half of the scene
 _FULL = 0.8  # share of the wanted points below which more are looked for
+_LOST = 0.5  # share of the points that a frame must keep not to be taken for one that shows nothing
+_BACK = 0.5  # share of the points before it that must be found again
+_PATIENCE = 6  # frames
+
+
+@dataclass(frozen=True, slots=True)
+class _Seen:
+    """Points in a picture."""
+
+    picture: U8
+    ids: I64
+    points: F32
 
 
 class PointTracker:
@@ -55,22 +71,39 @@ class PointTracker:
 
     def forget(self) -> None:
         """Another shot begins: nothing is followed into the next frame."""
-        self._before: U8 | None = None
-        self._ids, self._points = np.zeros(0, np.int64), np.zeros((0, 2), np.float32)
+        self._last: _Seen | None = None
+        self._behind: _Seen | None = None
+        """The last frame before most points were lost."""
+        self._patience = 0
 
     def sight(self, image: U8) -> Sight:
         """Where the points are in the next frame (H, W, 3), at source size; lost ones are replaced by others."""
         picture = self._cropped(image)
         now: U8 = np.asarray(self._even.apply(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)), np.uint8)
         usable = self._usable(picture)
-        if self._before is not None and len(self._points):
-            self._follow(self._before, now, usable)
-        if len(self._points) < _FULL * self._most:
-            self._refill(now, usable)
-        self._before = now
+        seen = self._kept(now, usable)
+        if len(seen.ids) < _FULL * self._most:
+            seen = self._refilled(seen, usable)
+        self._last = seen
         scale = np.array(self._grid.size[::-1]) / np.array(self._size[::-1])
-        places = ((self._points + 0.5) * scale).astype(np.float32)
-        return Sight(self._ids, places, float(np.sqrt(scale[0] * scale[1])))
+        places = ((seen.points + 0.5) * scale).astype(np.float32)
+        return Sight(seen.ids, places, float(np.sqrt(scale[0] * scale[1])))
+
+    def _kept(self, now: U8, usable: U8) -> _Seen:
+        """The points that are still seen, or seen again."""
+        if self._last is None:
+            return _Seen(now, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
+        kept = _followed(self._last, now, usable)
+        if self._behind is not None:
+            back = _followed(self._behind, now, usable)
+            self._patience -= 1
+            found = len(back.ids) >= _BACK * len(self._behind.ids)
+            if found or self._patience == 0:
+                self._behind = None
+            return _united(back, kept, self._most) if found else kept
+        if len(kept.ids) < _LOST * len(self._last.ids):
+            self._behind, self._patience = self._last, _PATIENCE
+        return kept
 
     def _cropped(self, image: U8) -> U8:
         top, left, bottom, right = self._grid.field_of_view.box
@@ -85,30 +118,44 @@ class PointTracker:
         red, green, blue = cv2.split(picture)
         _, bright = cv2.threshold(cv2.min(cv2.min(red, green), blue), _BRIGHT, 255, cv2.THRESH_BINARY)
         bright = cv2.dilate(bright, np.ones((9, 9), np.uint8))
-        return np.where((self._inside > 0) & (bright == 0), np.uint8(255), np.uint8(0))
+        lit = np.asarray(cv2.max(cv2.max(red, green), blue)) > _BLACK
+        return np.where((self._inside > 0) & (bright == 0) & lit, np.uint8(255), np.uint8(0))
 
-    def _follow(self, before: U8, now: U8, usable: U8) -> None:
-        there, found = _flow(before, now, self._points)
-        back, returned = _flow(now, before, there)
-        height, width = now.shape
-        nearest = np.rint(there).astype(int)
-        inside = ((nearest >= 0) & (nearest < (width, height))).all(1)
-        column, row = nearest[:, 0].clip(0, width - 1), nearest[:, 1].clip(0, height - 1)
-        kept = found & returned & inside & (usable[row, column] > 0)
-        kept &= np.linalg.norm(back - self._points, axis=1) < _RETURN
-        self._ids, self._points = self._ids[kept], there[kept]
-
-    def _refill(self, now: U8, usable: U8) -> None:
+    def _refilled(self, seen: _Seen, usable: U8) -> _Seen:
         free = usable.copy()
-        for column, row in np.rint(self._points).astype(int).tolist():
+        for column, row in np.rint(seen.points).astype(int).tolist():
             cv2.circle(free, (column, row), _SPACING, 0, -1)
-        corners: Any = cv2.goodFeaturesToTrack(now, self._most - len(self._points), _QUALITY, _SPACING, mask=free)
+        wanted = self._most - len(seen.ids)
+        corners: Any = cv2.goodFeaturesToTrack(seen.picture, wanted, _QUALITY, _SPACING, mask=free)
         if corners is None:
-            return
-        fresh = np.asarray(corners, np.float32).reshape(-1, 2)
-        self._points = np.concatenate([self._points, fresh])
-        self._ids = np.concatenate([self._ids, np.arange(self._next, self._next + len(fresh))])
-        self._next += len(fresh)
+            return seen
+        points = np.asarray(corners, np.float32).reshape(-1, 2)
+        ids = np.arange(self._next, self._next + len(points))
+        self._next += len(points)
+        return _Seen(seen.picture, np.concatenate([seen.ids, ids]), np.concatenate([seen.points, points]))
+
+
+def _followed(seen: _Seen, now: U8, usable: U8) -> _Seen:
+    """What is found of the points in another picture, where ``usable`` is not 0."""
+    if not len(seen.ids):
+        return _Seen(now, seen.ids, seen.points)
+    there, found = _flow(seen.picture, now, seen.points)
+    back, returned = _flow(now, seen.picture, there)
+    height, width = now.shape
+    nearest = np.rint(there).astype(int)
+    inside = ((nearest >= 0) & (nearest < (width, height))).all(1)
+    column, row = nearest[:, 0].clip(0, width - 1), nearest[:, 1].clip(0, height - 1)
+    kept = found & returned & inside & (usable[row, column] > 0)
+    kept &= np.linalg.norm(back - seen.points, axis=1) < _RETURN
+    return _Seen(now, seen.ids[kept], there[kept])
+
+
+def _united(back: _Seen, kept: _Seen, most: int) -> _Seen:
+    """Points that came back, and as many of the others as there is room for."""
+    new = np.flatnonzero(~np.isin(kept.ids, back.ids))[: max(0, most - len(back.ids))]
+    ids = np.concatenate([back.ids, kept.ids[new]])
+    order = np.argsort(ids)
+    return _Seen(back.picture, ids[order], np.concatenate([back.points, kept.points[new]])[order])
 
 
 def _followed_size(height: int, width: int, most: int) -> Size:

@@ -142,6 +142,18 @@ def test_frames_without_points_leave_as_they_came() -> None:
         np.testing.assert_allclose(after.world_from_camera, before.world_from_camera, atol=1e-12)
 
 
+@pytest.mark.parametrize("lost", [16, 17])
+def test_a_frame_that_shows_nothing_lies_on_the_way(lost: int) -> None:
+    """Whatever the network says of a black frame, key frame or not; the others are as good as ever."""
+    frames = placed()
+    pose = frames[lost].world_from_camera.copy()
+    pose[:3, :3] = rotations(np.array([[0.3, -0.4, 0.2]]))[0] @ pose[:3, :3]
+    nothing = Sight(np.zeros(0, np.int64), np.zeros((0, 2), np.float32), 0.33)
+    frames[lost] = replace(frames[lost], world_from_camera=pose, sight=nothing)
+    assert turn_errors(frames).max() > 20
+    assert turn_errors(refined(frames)).max() < 0.3
+
+
 def test_sights_that_contradict_each_other_change_nothing() -> None:
     rng = np.random.default_rng(0)
     frames = [

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from bathyscope.model_spec import InputSpec
@@ -83,3 +84,27 @@ def test_large_frames_are_followed_at_the_size_asked_for() -> None:
 
 def test_a_black_picture_has_no_points() -> None:
     assert len(tracker().sight(np.zeros((*SIZE, 3), np.uint8)).ids) == 0
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_points_come_back_after_frames_that_show_nothing(frames: int) -> None:
+    """Heavily blurred or black ones, in the middle of a motion; nothing is kept of what was followed in them."""
+    follow = tracker()
+    first = follow.sight(view(20, 20))
+    blurred = np.asarray(cv2.GaussianBlur(view(22, 20), (0, 0), 12), np.uint8)
+    for picture in (blurred, np.zeros_like(blurred))[:frames]:
+        assert len(shared(first, follow.sight(picture))[0]) < 0.1 * len(first.ids)
+    again = follow.sight(view(24, 19))
+    before, after = shared(first, again)
+    assert len(before) > 0.7 * len(first.ids)
+    np.testing.assert_allclose(np.median(SCALE * (after - before), 0), (-4, 1), atol=0.05)
+    assert (np.diff(again.ids) > 0).all()
+    assert len(again.ids) <= TrackSettings().points
+
+
+def test_points_that_stay_away_are_given_up() -> None:
+    follow = tracker()
+    first = follow.sight(view(20, 20))
+    for _ in range(7):
+        follow.sight(np.zeros((*SIZE, 3), np.uint8))
+    assert not len(shared(first, follow.sight(view(20, 20)))[0])
