@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from bathyscope.engines import DepthOptions
 from bathyscope.errors import BathyscopeError, ServiceError, SettingsError
-from bathyscope.result import DepthKind
+from bathyscope.result import DepthKind, PointAgreement
 from bathyscope.result_files import Precision
 from bathyscope_client.batch import BatchSettings, ClipReport, run_batch
 from bathyscope_client.client import DepthClient
@@ -126,3 +126,12 @@ def _tell(report: ClipReport, as_json: bool) -> None:
     if not as_json:
         note = " (was already done)" if report.status == "skipped" else ""
         typer.echo(f"{report.name}: {report.outputs['depth']} and {len(report.outputs) - 1} files beside it{note}")
+        if report.meta is not None and report.meta.agreement is not None:
+            typer.echo(f"{report.name}: {_said_of(report.meta.agreement)}")
+
+
+def _said_of(found: PointAgreement) -> str:
+    return (
+        f"the network's depth differs from that of followed points by {found.difference:.1%} "
+        f"({found.points:.0f} a frame, in {found.frames} frames)"
+    )

@@ -17,7 +17,7 @@ from bathyscope.camera import F64, Size
 from bathyscope.errors import GeometryError
 from bathyscope.model_spec import Output
 
-RESULT_FORMAT = 2
+RESULT_FORMAT = 3
 """Version of the result files; a reader refuses newer ones."""
 DepthKind = Literal["rendered", "accumulated", "head"]
 """Where depth comes from."""
@@ -29,6 +29,20 @@ class BundleId(BaseModel, frozen=True, extra="forbid"):
     name: str
     version: str
     digest: str = Field(description="SHA-256 over the bundle's manifest, which names the hash of every file.")
+
+
+class PointAgreement(BaseModel, frozen=True, extra="forbid"):
+    """How far the network's depth is from points that were followed through the video, before they corrected it.
+
+    An estimate of the depth's error that needs no ground truth, where there is something to follow: it ranks networks
+    on the same video, and it is not AbsRel, since points lie where there is texture.
+    """
+
+    difference: float = Field(
+        ge=0, description="Mean of |depth / depth of the point - 1|, each frame scaled by its median."
+    )
+    points: float = Field(gt=0, description="Mean number of points in a frame whose depth is certain by their rays.")
+    frames: int = Field(gt=0, description="Frames that have enough of them.")
 
 
 class ResultMeta(BaseModel, frozen=True, extra="forbid"):
@@ -55,6 +69,9 @@ class ResultMeta(BaseModel, frozen=True, extra="forbid"):
     software: str = ""
     complete: bool = Field(default=True, description="False: the source ended early or was damaged; see warnings.")
     warnings: tuple[str, ...] = ()
+    agreement: PointAgreement | None = Field(
+        default=None, description="With followed points; none if there was nothing to follow or no motion to tell by."
+    )
     settings: dict[str, Any] = Field(default_factory=dict)
     timings_s: dict[str, float] = Field(default_factory=dict)
 

@@ -73,6 +73,7 @@ class SceneSession(DepthSession):
             yield ready
         with self._timed("refine"):
             ready = refiner.finish()
+        self._meaning = self._meaning.model_copy(update={"agreement": refiner.agreement})
         yield ready
 
     def _rendered(self, placed: Iterable[list[PlacedFrame]], grid: Grid) -> Iterator[PlacedFrame]:

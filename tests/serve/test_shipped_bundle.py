@@ -49,6 +49,8 @@ def test_the_lumen_of_the_demo_clip_is_far_and_its_wall_near(bundle: Bundle) -> 
     assert np.median(middle.max((1, 2))) > 2 * np.median(edge)
     np.testing.assert_array_equal(result.world_from_camera[0], np.eye(4))
     assert np.degrees(rotation_angle(result.world_from_camera[-1, :3, :3])) < 45
+    assert result.meta.agreement is not None
+    assert result.meta.agreement.difference < 0.15
 
 
 def test_warming_up_compiles_the_adjustment_too(bundle: Bundle, monkeypatch: pytest.MonkeyPatch) -> None:

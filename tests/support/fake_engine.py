@@ -10,7 +10,7 @@ import numpy as np
 from bathyscope.bundle import Bundle, BundleManifest
 from bathyscope.engines import DepthOptions
 from bathyscope.errors import ClipError
-from bathyscope.result import FrameDepth, ResultMeta
+from bathyscope.result import FrameDepth, PointAgreement, ResultMeta
 
 NOT_A_CLIP = b"this is not a clip"
 BREAKS = b"breaks the engine"
@@ -75,6 +75,7 @@ class FakeRun:
             depth=self._options.depth,
             bundle=self._engine.bundle.id,
             settings=json.loads(self._options.model_dump_json()),
+            agreement=PointAgreement(difference=0.125, points=200, frames=3),
             timings_s={"decode": 0.25},
         )
 

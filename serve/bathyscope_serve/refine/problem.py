@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from bathyscope.camera import F64, invert_pose
 from bathyscope_serve.alignment import blend_poses
 from bathyscope_serve.refine.adjustment import Sights, State, adjust, misses, uncertainty
-from bathyscope_serve.refine.depth_field import DepthField, KnownDepths, fit_field
+from bathyscope_serve.refine.depth_field import KnownDepths
 from bathyscope_serve.refine.resection import resect
 from bathyscope_serve.refine.tracked_frame import TrackedFrame, carry
 
@@ -95,16 +95,14 @@ class Problem:
         numbers = view.numbers[seen]
         return invert_pose(resect(invert_pose(carried[0]), points, numbers[:, :2], numbers[:, 2]))
 
-    def field(self, view: TrackedFrame, before: DepthField) -> DepthField:
-        """The correction of a frame's depth."""
+    def known(self, view: TrackedFrame) -> KnownDepths:
+        """What the points say about a frame's depth."""
         seen, points, doubt = self._met(view)
         camera = view.camera_from_world
         local = points @ camera[:3, :3].T + camera[:3, 3]
         numbers = view.numbers[seen]
         good = (misses(local, numbers) < _MISSED) & (doubt < _DOUBTFUL) & np.isfinite(numbers[:, 3])
-        size = view.frame.depth.shape[0], view.frame.depth.shape[1]
-        shown = KnownDepths(view.places[seen][good], numbers[good, 3], np.log(local[good, 2]), doubt[good])
-        return fit_field(shown, size, before)
+        return KnownDepths(view.places[seen][good], numbers[good, 3], np.log(local[good, 2]), doubt[good])
 
     def _met(self, view: TrackedFrame) -> tuple[I64, F64, F64]:
         """Which of a frame's points are known well, where they are, and their doubt."""

@@ -15,9 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from bathyscope.camera import F64
+from bathyscope.result import PointAgreement
 from bathyscope_serve.engine_settings import RefineSettings
 from bathyscope_serve.placed import PlacedFrame
-from bathyscope_serve.refine.depth_field import DepthField, plain_field
+from bathyscope_serve.refine.agreement import FrameAgreement, clip_agreement, frame_agreement
+from bathyscope_serve.refine.depth_field import DepthField, fit_field, plain_field
 from bathyscope_serve.refine.problem import Problem
 from bathyscope_serve.refine.tracked_frame import TrackedFrame, carry, track
 
@@ -38,6 +40,12 @@ class Refiner:
         """Key frames that have come since the last adjustment."""
         self._intrinsics: F64 | None = None
         """Of the segment: a lens does not change, what the windows make of it does."""
+        self._agreements: list[FrameAgreement] = []
+
+    @property
+    def agreement(self) -> PointAgreement | None:
+        """How far the depth that came in is from the points, over all frames that have been given out."""
+        return clip_agreement(self._agreements)
 
     def add(self, frames: list[PlacedFrame]) -> list[PlacedFrame]:
         """Frames that have become final."""
@@ -81,6 +89,7 @@ class Refiner:
             self._spread(problem)
         end = len(self._open) if wait == 0 else self._open.index(keys[-wait]) if len(keys) > wait else 0
         ready, self._open = self._open[:end], self._open[end:]
+        self._agreements += [view.agreement for view in ready if view.agreement is not None]
         refined = [view.refined() for view in ready]
         self._fixed = [*self._fixed, *(view.without_maps() for view in ready if view.frame.key)]
         self._fixed = self._fixed[-self._settings.past :]
@@ -97,7 +106,9 @@ class Refiner:
                 later = self._open[number + 1 :]
                 after = next((other for other in later if other.frame.key and other.shows), None)
                 view.world_from_camera = problem.between(view, before, after)
-            field = view.field = problem.field(view, field)
+            known = problem.known(view)
+            field = view.field = fit_field(known, view.size, field)
+            view.agreement = frame_agreement(known)
             view.settled = True
 
 

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.camera import F64, invert_pose
+from bathyscope.camera import F64, Size, invert_pose
 from bathyscope_serve.placed import PlacedFrame
+from bathyscope_serve.refine.agreement import FrameAgreement
 from bathyscope_serve.refine.depth_field import DepthField
 
 I64 = NDArray[np.int64]
@@ -30,6 +31,13 @@ class TrackedFrame:
     field: DepthField
     settled: bool = False
     """Whether it has been adjusted once."""
+    agreement: FrameAgreement | None = None
+    """Of its own depth with its points."""
+
+    @property
+    def size(self) -> Size:
+        """(height, width) of its maps."""
+        return self.frame.depth.shape[0], self.frame.depth.shape[1]
 
     @property
     def shows(self) -> bool:

@@ -154,6 +154,23 @@ def test_a_frame_that_shows_nothing_lies_on_the_way(lost: int) -> None:
     assert turn_errors(refined(frames)).max() < 0.3
 
 
+def test_errors_of_the_shape_of_depth_are_known_without_the_truth() -> None:
+    """Half of the picture a quarter too deep; wandering scale and trembling cameras do not count."""
+    told = []
+    for wrong in (1.0, 1.25):
+        refiner = Refiner(RefineSettings())
+        for frame in placed():
+            depth = frame.depth.copy()
+            depth[:, SIZE[1] // 2 :] *= wrong
+            refiner.add([replace(frame, depth=depth)])
+        refiner.finish()
+        assert refiner.agreement is not None
+        assert refiner.agreement.frames > 0.9 * FRAMES
+        told.append(refiner.agreement.difference)
+    assert told[0] < 0.02
+    assert 0.08 < told[1] < 0.14  # a half of 25 %, or of 20 %, by the side that the median is on
+
+
 def test_sights_that_contradict_each_other_change_nothing() -> None:
     rng = np.random.default_rng(0)
     frames = [
