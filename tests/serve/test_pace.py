@@ -18,11 +18,11 @@ def texture() -> np.ndarray:
     return np.asarray((smooth - smooth.min()) / np.ptp(smooth))
 
 
-def keys(shifts: list[int], *, cut: int | None = None) -> list[int]:
+def keys(shifts: list[int], *, cut: int | None = None, black: tuple[int, ...] = ()) -> list[int]:
     """Numbers of the key frames of a picture that slides by whole pixels."""
     picture = texture()
     frames = [
-        (SmallFrame(i, i / 25, np.repeat(picture[None, :, x : x + SIZE[1]], 3, 0)), i == cut)
+        (SmallFrame(i, i / 25, np.repeat(picture[None, :, x : x + SIZE[1]], 3, 0) * (i not in black)), i == cut)
         for i, x in enumerate(shifts)
     ]
     settings = PaceSettings(motion=0.02, longest=5)
@@ -41,3 +41,9 @@ def test_a_still_camera_has_key_frames_too() -> None:
 
 def test_a_shot_begins_with_a_key_frame() -> None:
     assert keys([0] * 9, cut=3) == [0, 3, 8]
+
+
+def test_black_frames_are_no_key_frames_but_for_the_first_of_a_shot_and_the_longest_wait() -> None:
+    assert keys(list(range(10)), black=(2, 5)) == [0, 3, 6, 9]
+    assert keys([0] * 9, black=(3, 5), cut=3) == [0, 3, 8]
+    assert keys([0] * 12, black=tuple(range(12))) == [0, 5, 10]

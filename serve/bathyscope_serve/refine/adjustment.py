@@ -5,10 +5,12 @@ With :math:`X_p` the point, :math:`(R_c, t_c)` the camera, :math:`Y = R_c X_p + 
 
 .. math::
     \sum_{(p, c)} \rho_4\left(f^2 \left\| (Y_1, Y_2) / Y_3 - (x, y) \right\|^2\right)
-        + \rho_1\left(\log^2 (Y_3 / d) / \tau^2\right), \qquad \rho_k(e) = k \log(1 + e / k)
+        + \rho_1\left(\log^2 (Y_3 / d) / \tau_c^2\right), \qquad \rho_k(e) = k \log(1 + e / k)
 
 is made small by Levenberg-Marquardt with the points eliminated. The second term is weak: where the camera hardly moves,
-points stay where the frames have them; elsewhere the rays decide.
+points stay where the frames have them; elsewhere the rays decide. The n_c sights of a camera together hold its scale
+by about :math:`\tau_c / \sqrt{n_c}`, so :math:`\tau_c = \tau \min(1, \sqrt{n_c / 300})`: a camera that few points
+tie to the others keeps the scale that the network gives it.
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ from bathyscope_serve.refine.kernels import misfit, moved_points, normal_equatio
 I64 = NDArray[np.int64]
 
 TOLERANCE = 3.0
-"""Standard deviation of log depth, τ."""
+"""Standard deviation of log depth, τ, in a camera with many sights."""
+MANY = 300
+"""Sights of a camera."""
 _ROUNDS = 20
 _ENOUGH = 1e-4
 _DAMPING = 1e-3
@@ -40,6 +44,12 @@ class Sights:
     """(m,)"""
     numbers: F64
     """(m, 4) ray x and y, focal length in pixels, logarithm of the depth or NaN."""
+
+    @property
+    def tolerance(self) -> F64:
+        """(m,) standard deviation of log depth, τ_c."""
+        count = np.bincount(self.camera)
+        return np.asarray(TOLERANCE * np.minimum(1.0, np.sqrt(count / MANY))[self.camera], np.float64)
 
     @property
     def start(self) -> I64:
@@ -129,7 +139,9 @@ def uncertainty(sights: Sights, state: State) -> F64:
 
 def _cost(start: I64, sights: Sights, state: State) -> float:
     numbers, work = sights.numbers, np.zeros((2, 3))
-    cost = misfit(start, sights.camera, numbers, state.rotation, state.translation, state.points, TOLERANCE, work)
+    cost = misfit(
+        start, sights.camera, numbers, state.rotation, state.translation, state.points, sights.tolerance, work
+    )
     return float(cost)
 
 
@@ -164,7 +176,7 @@ class _Equations:
             state.rotation,
             state.translation,
             state.points,
-            TOLERANCE,
+            sights.tolerance,
             damping,
             self.matrix,
             self.right,

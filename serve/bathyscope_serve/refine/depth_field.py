@@ -20,6 +20,8 @@ F32 = NDArray[np.float32]
 _GRID = np.linspace(-0.9, 0.9, 6)
 _WIDTH = 0.8 * (_GRID[1] - _GRID[0])
 _PLAIN = 4
+LEAST_POINTS = 8
+"""Below that, a frame keeps what is expected of it."""
 _SPREAD = np.concatenate([[1.0, 0.1, 0.1, 0.03], np.full(_GRID.size**2, 0.06)])
 """Standard deviations before anything is known; of a around that of the frame before, of the others around 0."""
 _KEPT = np.concatenate([[1.0], np.full(len(_SPREAD) - 1, 0.8)])
@@ -28,7 +30,6 @@ _MOST = np.concatenate([[np.inf], np.full(_PLAIN - 1 + _GRID.size**2, 0.4)])
 _LEAST_NOISE = 0.03
 _TRUST = 2.0  # errors of points are larger than their doubt: cameras are off, too
 _WORTH = 200  # independent points at most: neighbours say the same
-_LEAST = 8
 _ROUNDS = 8
 
 
@@ -45,6 +46,10 @@ class DepthField:
     def scale(self) -> float:
         """The factor at the middle of the picture, but for the bumps."""
         return float(np.exp(self.values[0]))
+
+    def at_scale(self, scale: float) -> DepthField:
+        """The same with another factor."""
+        return DepthField(np.concatenate([[np.log(scale)], self.values[1:]]), self.middle)
 
     def applied(self, depth: F32, known: NDArray[np.bool_]) -> F32:
         """The depth map (h, w), corrected where it is known."""
@@ -87,7 +92,7 @@ def fit_field(points: KnownDepths, size: Size, before: DepthField) -> DepthField
         size: (height, width) of the picture.
         before: Of the frame before. Its scale is expected; without points it is the answer, but for a part that fades.
     """
-    if len(points.own) < _LEAST:
+    if len(points.own) < LEAST_POINTS:
         return DepthField(before.values * _KEPT, before.middle)
     expected = plain_field(before.scale).values
     middle = float(np.median(points.own))

@@ -40,7 +40,7 @@ def _residual(seen: F64, sight: F64, tolerance: float, residual: F64) -> None:
 
 @kernel
 def misfit(
-    start: I64, camera: I64, sights: F64, rotation: F64, translation: F64, points: F64, tolerance: float, work: F64
+    start: I64, camera: I64, sights: F64, rotation: F64, translation: F64, points: F64, tolerance: F64, work: F64
 ) -> Any:
     """Robust cost of a state; ``work`` (2, 3)."""
     seen, residual = work[0], work[1]
@@ -52,7 +52,7 @@ def misfit(
             if seen[2] <= NEAREST:
                 cost += _BEHIND
                 continue
-            _residual(seen, sights[i], tolerance, residual)
+            _residual(seen, sights[i], tolerance[i], residual)
             e = residual[0] * residual[0] + residual[1] * residual[1]
             cost += LOOSE * log1p(e / LOOSE) + log1p(residual[2] * residual[2])
     return cost
@@ -101,7 +101,7 @@ def normal_equations(
     rotation: F64,
     translation: F64,
     points: F64,
-    tolerance: float,
+    tolerance: F64,
     damping: float,
     matrix: F64,
     right: F64,
@@ -121,7 +121,7 @@ def normal_equations(
         rotation: (c, 3, 3) camera from world.
         translation: (c, 3)
         points: (n, 3)
-        tolerance: Standard deviation of the logarithm of depth.
+        tolerance: (m,) Standard deviations of the logarithm of depth.
         damping: Levenberg-Marquardt, relative to the diagonal.
         matrix: (6 f, 6 f) out.
         right: (6 f,) out: the gradient.
@@ -145,8 +145,8 @@ def normal_equations(
             _see(rotation[c], translation[c], points[p], seen)
             if seen[2] <= NEAREST:
                 continue
-            _residual(seen, sights[i], tolerance, residual)
-            _jacobians(seen, sights[i], tolerance, rotation[c], of_camera, of_point)
+            _residual(seen, sights[i], tolerance[i], residual)
+            _jacobians(seen, sights[i], tolerance[i], rotation[c], of_camera, of_point)
             weight = 1 / (1 + (residual[0] * residual[0] + residual[1] * residual[1]) / LOOSE)
             at = 6 * column[c]
             for row in range(3):

@@ -8,11 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bathyscope.camera import F64, invert_pose
-from bathyscope_serve.alignment import blend_poses
 from bathyscope_serve.refine.adjustment import Sights, State, adjust, misses, uncertainty
 from bathyscope_serve.refine.depth_field import KnownDepths
 from bathyscope_serve.refine.resection import resect
-from bathyscope_serve.refine.tracked_frame import TrackedFrame, carry
+from bathyscope_serve.refine.tracked_frame import TrackedFrame
 
 I64 = NDArray[np.int64]
 
@@ -79,21 +78,11 @@ class Problem:
             pose[:3, :3], pose[:3, 3] = found.rotation[number], found.translation[number]
             self._keys[number].world_from_camera = invert_pose(pose)
 
-    def between(self, view: TrackedFrame, before: TrackedFrame | None, after: TrackedFrame | None) -> F64:
-        """The camera of a frame that is none of the key frames: between those around it, then by the points.
-
-        Of a frame that shows nothing the network cannot know where it is: it is taken to lie on the way.
-        """
-        ends = [end for end in (before, after) if end is not None]
-        if not ends:
-            return view.world_from_camera
-        carried = [carry(view.frame, end) if view.shows else end.world_from_camera for end in ends]
-        if len(ends) == 2:
-            first, last = (end.frame.index for end in ends)
-            carried[0] = blend_poses(carried[0], carried[1], (view.frame.index - first) / (last - first))
+    def resected(self, view: TrackedFrame, near: F64) -> F64:
+        """The camera of a frame that is none of the key frames, by the points, from one that is near it."""
         seen, points, _ = self._met(view)
         numbers = view.numbers[seen]
-        return invert_pose(resect(invert_pose(carried[0]), points, numbers[:, :2], numbers[:, 2]))
+        return invert_pose(resect(invert_pose(near), points, numbers[:, :2], numbers[:, 2]))
 
     def known(self, view: TrackedFrame) -> KnownDepths:
         """What the points say about a frame's depth."""

@@ -19,9 +19,11 @@ from bathyscope.result import PointAgreement
 from bathyscope_serve.engine_settings import RefineSettings
 from bathyscope_serve.placed import PlacedFrame
 from bathyscope_serve.refine.agreement import FrameAgreement, clip_agreement, frame_agreement
-from bathyscope_serve.refine.depth_field import DepthField, fit_field, plain_field
+from bathyscope_serve.refine.depth_field import LEAST_POINTS, DepthField, fit_field, plain_field
 from bathyscope_serve.refine.problem import Problem
-from bathyscope_serve.refine.tracked_frame import TrackedFrame, carry, track
+from bathyscope_serve.refine.tracked_frame import TrackedFrame, carry, on_the_way, track
+
+_USUAL = 5  # key frames
 
 
 class Refiner:
@@ -40,6 +42,8 @@ class Refiner:
         """Key frames that have come since the last adjustment."""
         self._intrinsics: F64 | None = None
         """Of the segment: a lens does not change, what the windows make of it does."""
+        self._scales: list[float] = []
+        """Of depth, by the last key frames that were given out and whose points said something about it."""
         self._agreements: list[FrameAgreement] = []
 
     @property
@@ -63,7 +67,7 @@ class Refiner:
     def finish(self) -> list[PlacedFrame]:
         """What is left of the segment."""
         ready = self._settle(0) if self._open else []
-        self._fixed, self._open, self._fresh, self._intrinsics = [], [], 0, None
+        self._fixed, self._open, self._scales, self._fresh, self._intrinsics = [], [], [], 0, None
         return ready
 
     def _view(self, frame: PlacedFrame) -> TrackedFrame:
@@ -74,7 +78,8 @@ class Refiner:
         keys = [view for view in [*self._fixed, *self._open] if view.frame.key and view.shows and view.settled]
         if not keys:
             return frame.world_from_camera, plain_field(1.0)
-        return carry(frame, keys[-1]), plain_field(keys[-1].field.scale)
+        scale = _usual([*self._scales, *(view.field.scale for view in self._open if view.frame.key and view.measured)])
+        return carry(frame, keys[-1], scale), plain_field(scale)
 
     def _settle(self, wait: int) -> list[PlacedFrame]:
         """Adjust what is open, and give out all but the last key frames."""
@@ -86,30 +91,44 @@ class Refiner:
         problem = Problem.of(self._fixed[-self._settings.past :], keys)
         if problem is not None:
             problem.solve()
-            self._spread(problem)
+        self._spread(problem)
         end = len(self._open) if wait == 0 else self._open.index(keys[-wait]) if len(keys) > wait else 0
         ready, self._open = self._open[:end], self._open[end:]
         self._agreements += [view.agreement for view in ready if view.agreement is not None]
+        self._scales += [view.field.scale for view in ready if view.frame.key and view.measured]
+        self._scales = self._scales[-_USUAL:]
         refined = [view.refined() for view in ready]
         self._fixed = [*self._fixed, *(view.without_maps() for view in ready if view.frame.key)]
         self._fixed = self._fixed[-self._settings.past :]
         return refined
 
-    def _spread(self, problem: Problem) -> None:
+    def _spread(self, problem: Problem | None) -> None:
         """To the frames between the key frames, and to every frame's depth."""
-        before: TrackedFrame | None = self._fixed[-1] if self._fixed else None
+        keys = [view for view in self._fixed if view.shows]
+        before, scales = keys[-1] if keys else None, [*self._scales]
         field = before.field if before is not None else plain_field(1.0)
         for number, view in enumerate(self._open):
             if view.frame.key and view.shows:
                 before = view
-            else:
+            elif problem is not None or not view.shows:
                 later = self._open[number + 1 :]
                 after = next((other for other in later if other.frame.key and other.shows), None)
-                view.world_from_camera = problem.between(view, before, after)
+                near = on_the_way(view, before, after, _usual(scales))
+                view.world_from_camera = near if problem is None else problem.resected(view, near)
+            if problem is None:
+                continue
             known = problem.known(view)
-            field = view.field = fit_field(known, view.size, field)
+            field = view.field = fit_field(known, view.size, field.at_scale(_usual(scales)))
+            view.measured = len(known.own) >= LEAST_POINTS
+            if view.frame.key and view.measured:
+                scales.append(view.field.scale)
             view.agreement = frame_agreement(known)
             view.settled = True
+
+
+def _usual(scales: list[float]) -> float:
+    """Of the last of them: one may be that of a blurred frame."""
+    return float(np.exp(np.median(np.log(scales[-_USUAL:])))) if scales else 1.0
 
 
 def _one_lens(frames: list[PlacedFrame]) -> F64:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bathyscope.camera import F64, Size, invert_pose
+from bathyscope_serve.alignment import blend_poses
 from bathyscope_serve.placed import PlacedFrame
 from bathyscope_serve.refine.agreement import FrameAgreement
 from bathyscope_serve.refine.depth_field import DepthField
@@ -31,6 +32,8 @@ class TrackedFrame:
     field: DepthField
     settled: bool = False
     """Whether it has been adjusted once."""
+    measured: bool = False
+    """Whether its depth was corrected by points of its own."""
     agreement: FrameAgreement | None = None
     """Of its own depth with its points."""
 
@@ -86,8 +89,29 @@ def track(frame: PlacedFrame, world_from_camera: F64, field: DepthField) -> Trac
     return TrackedFrame(frame, sight.ids, numbers, places, world_from_camera, field)
 
 
-def carry(frame: PlacedFrame, key: TrackedFrame) -> F64:
-    """The camera of a frame in the refined world, as it stands to a key frame in that of the windows."""
+def carry(frame: PlacedFrame, key: TrackedFrame, scale: float) -> F64:
+    """The camera of a frame in the refined world, as it stands to a key frame in that of the windows.
+
+    Args:
+        frame: As the windows place it.
+        key: A key frame that has been adjusted.
+        scale: Of the refined world over that of the windows, thereabouts.
+    """
     between = invert_pose(key.frame.world_from_camera) @ frame.world_from_camera
-    between[:3, 3] *= key.field.scale
+    between[:3, 3] *= scale
     return np.asarray(key.world_from_camera @ between, np.float64)
+
+
+def on_the_way(frame: TrackedFrame, before: TrackedFrame | None, after: TrackedFrame | None, scale: float) -> F64:
+    """The camera of a frame by those of the key frames around it, and by how it stands to them in the windows.
+
+    Of a frame that shows nothing the network cannot know that: it is taken to lie between them.
+    """
+    ends = [end for end in (before, after) if end is not None]
+    if not ends:
+        return frame.world_from_camera
+    poses = [carry(frame.frame, end, scale) if frame.shows else end.world_from_camera for end in ends]
+    if len(ends) == 1:
+        return poses[0]
+    first, last = (end.frame.index for end in ends)
+    return blend_poses(poses[0], poses[1], (frame.frame.index - first) / (last - first))

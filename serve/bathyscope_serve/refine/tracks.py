@@ -135,6 +135,14 @@ class PointTracker:
         return _Seen(seen.picture, np.concatenate([seen.ids, ids]), np.concatenate([seen.points, points]))
 
 
+def _united(back: _Seen, kept: _Seen, most: int) -> _Seen:
+    """Points that came back, and as many of the others as there is room for."""
+    new = np.flatnonzero(~np.isin(kept.ids, back.ids))[: max(0, most - len(back.ids))]
+    ids = np.concatenate([back.ids, kept.ids[new]])
+    order = np.argsort(ids)
+    return _Seen(back.picture, ids[order], np.concatenate([back.points, kept.points[new]])[order])
+
+
 def _followed(seen: _Seen, now: U8, usable: U8) -> _Seen:
     """What is found of the points in another picture, where ``usable`` is not 0."""
     if not len(seen.ids):
@@ -148,14 +156,6 @@ def _followed(seen: _Seen, now: U8, usable: U8) -> _Seen:
     kept = found & returned & inside & (usable[row, column] > 0)
     kept &= np.linalg.norm(back - seen.points, axis=1) < _RETURN
     return _Seen(now, seen.ids[kept], there[kept])
-
-
-def _united(back: _Seen, kept: _Seen, most: int) -> _Seen:
-    """Points that came back, and as many of the others as there is room for."""
-    new = np.flatnonzero(~np.isin(kept.ids, back.ids))[: max(0, most - len(back.ids))]
-    ids = np.concatenate([back.ids, kept.ids[new]])
-    order = np.argsort(ids)
-    return _Seen(back.picture, ids[order], np.concatenate([back.points, kept.points[new]])[order])
 
 
 def _followed_size(height: int, width: int, most: int) -> Size:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bathyscope.camera import F64, rotation_angle
-from bathyscope_serve.refine.adjustment import TOLERANCE, Sights, State, adjust, rotations, uncertainty
+from bathyscope_serve.refine.adjustment import MANY, TOLERANCE, Sights, State, adjust, rotations, uncertainty
 from bathyscope_serve.refine.kernels import LOOSE, misfit, normal_equations
 
 FOCAL = 300.0
@@ -105,7 +105,7 @@ def dense_step(sights: Sights, state: State, damping: float) -> tuple[F64, F64]:
         )
         seen = moved.seen(sights)
         off = sights.numbers[:, 2:3] * (seen[:, :2] / seen[:, 2:] - sights.numbers[:, :2])
-        return np.concatenate([off, ((np.log(seen[:, 2]) - sights.numbers[:, 3]) / TOLERANCE)[:, None]], 1)
+        return np.concatenate([off, ((np.log(seen[:, 2]) - sights.numbers[:, 3]) / sights.tolerance)[:, None]], 1)
 
     size = 18 + 3 * len(state.points)
     at = residuals(np.zeros(size))
@@ -130,7 +130,7 @@ def test_the_equations_are_those_of_a_plain_gauss_newton_step() -> None:
     column = np.array([-1, 0, 1, 2])
     normal_equations(
         sights.start, sights.camera, column, sights.numbers, state.rotation, state.translation, state.points,
-        TOLERANCE, damping, matrix, right, diagonal, coupling, inverse, slope, np.zeros((8, 6)),
+        sights.tolerance, damping, matrix, right, diagonal, coupling, inverse, slope, np.zeros((8, 6)),
     )  # fmt: skip
     found = -np.linalg.solve(matrix, right)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-7)
@@ -144,13 +144,20 @@ def test_the_cost_is_the_formula_of_the_docstring() -> None:
     state = shaken(truth, 6, np.ones(6, np.bool_))
     seen = state.seen(sights)
     off = FOCAL * (seen[:, :2] / seen[:, 2:] - sights.numbers[:, :2])
-    depth = (np.log(seen[:, 2]) - sights.numbers[:, 3]) / TOLERANCE
+    depth = (np.log(seen[:, 2]) - sights.numbers[:, 3]) / sights.tolerance
     expected = (4 * np.log1p((off**2).sum(1) / 4) + np.log1p(depth**2)).sum()
     found = misfit(
-        sights.start, sights.camera, sights.numbers, state.rotation, state.translation, state.points, TOLERANCE,
-        np.zeros((2, 3)),
+        sights.start, sights.camera, sights.numbers, state.rotation, state.translation, state.points,
+        sights.tolerance, np.zeros((2, 3)),
     )  # fmt: skip
     np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_the_sights_of_a_camera_hold_its_scale_equally_firmly_however_few_they_are() -> None:
+    camera = np.repeat([0, 1, 2], [12, MANY, 4 * MANY])
+    sights = Sights(np.arange(len(camera)), camera, np.zeros((len(camera), 4)))
+    information = np.bincount(camera, weights=1 / sights.tolerance**2)
+    np.testing.assert_allclose(information / (MANY / TOLERANCE**2), [1, 1, 4])
 
 
 def test_a_point_behind_a_camera_costs_much_and_pulls_at_nothing() -> None:

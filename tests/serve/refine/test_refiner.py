@@ -142,7 +142,18 @@ def test_frames_without_points_leave_as_they_came() -> None:
         np.testing.assert_allclose(after.world_from_camera, before.world_from_camera, atol=1e-12)
 
 
-@pytest.mark.parametrize("lost", [16, 17])
+def test_one_odd_key_frame_does_not_set_the_scale_of_what_follows() -> None:
+    """The last one with points is half as deep again as it should be; no point is seen twice after it."""
+    frames = placed(drift=0.0)
+    frames[24] = replace(frames[24], depth=1.5 * frames[24].depth)
+    for index in range(25, FRAMES):
+        sight = frames[index].sight
+        assert sight is not None
+        frames[index] = replace(frames[index], sight=replace(sight, ids=sight.ids + 10_000 * index))
+    assert np.abs(scales(refined(frames))).max() < 0.05
+
+
+@pytest.mark.parametrize("lost", [1, 16, 17])
 def test_a_frame_that_shows_nothing_lies_on_the_way(lost: int) -> None:
     """Whatever the network says of a black frame, key frame or not; the others are as good as ever."""
     frames = placed()
