@@ -2,8 +2,8 @@
 
 Corners are followed by pyramidal Lucas-Kanade in pictures whose contrast is evened out, since the light travels with
 the camera. A point is given up where following it back does not end where it began, at highlights, which do not stay
-with the tissue, and at the border of the field of view. Where most are lost at once, by a frame that is blurred or
-covered, they are looked for again in the frames after it.
+with the tissue, and at the border of the field of view. Where most are lost at once or the picture is blurred, those of
+the frame before are looked for again in the frames after it.
 """
 
 from __future__ import annotations
@@ -35,8 +35,9 @@ _QUALITY = 0.003
 _LEAST_PIXELS = 60_000  # smaller pictures are enlarged: windows must not hold half of the scene
 _FULL = 0.8  # share of the wanted points below which more are looked for
 _LOST = 0.5  # share of the points that a frame must keep not to be taken for one that shows nothing
-_BACK = 0.5  # share of the points before it that must be found again
+_LEAST = 20  # points that come back
 _PATIENCE = 6  # frames
+_BLURRED = 0.7  # of the sharpness before: what is followed through such a frame comes out beside where it went in
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,17 +94,23 @@ class PointTracker:
         """The points that are still seen, or seen again."""
         if self._last is None:
             return _Seen(now, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
-        kept = _followed(self._last, now, usable)
-        if self._behind is not None:
-            back = _followed(self._behind, now, usable)
-            self._patience -= 1
-            found = len(back.ids) >= _BACK * len(self._behind.ids)
-            if found or self._patience == 0:
-                self._behind = None
-            return _united(back, kept, self._most) if found else kept
-        if len(kept.ids) < _LOST * len(self._last.ids):
-            self._behind, self._patience = self._last, _PATIENCE
+        last, behind = self._last, self._behind
+        kept = _followed(last, now, usable)
+        begins = _is_blurred(now, last.picture) and (behind is None or not _is_blurred(last.picture, behind.picture))
+        if behind is not None:
+            kept = self._brought_back(kept, behind, usable)
+        if begins or (behind is None and len(kept.ids) < _LOST * len(last.ids)):
+            self._behind, self._patience = last, _PATIENCE
         return kept
+
+    def _brought_back(self, kept: _Seen, behind: _Seen, usable: U8) -> _Seen:
+        """With the points of an earlier frame, if more of them are found from there than through the frames between."""
+        back = _followed(behind, kept.picture, usable)
+        found = len(back.ids) > max(_LEAST, np.isin(kept.ids, behind.ids).sum())
+        self._patience -= 1
+        if self._patience == 0 or (found and not _is_blurred(kept.picture, behind.picture)):
+            self._behind = None
+        return _united(back, kept, behind.ids, self._most) if found else kept
 
     def _cropped(self, image: U8) -> U8:
         top, left, bottom, right = self._grid.field_of_view.box
@@ -135,9 +142,20 @@ class PointTracker:
         return _Seen(seen.picture, np.concatenate([seen.ids, ids]), np.concatenate([seen.points, points]))
 
 
-def _united(back: _Seen, kept: _Seen, most: int) -> _Seen:
-    """Points that came back, and as many of the others as there is room for."""
-    new = np.flatnonzero(~np.isin(kept.ids, back.ids))[: max(0, most - len(back.ids))]
+def _is_blurred(picture: U8, before: U8) -> bool:
+    """Whether much less can be seen in it than before."""
+    return _sharpness(picture) < _BLURRED * _sharpness(before)
+
+
+def _sharpness(picture: U8) -> float:
+    """Of what is larger than noise."""
+    half = np.asarray(cv2.pyrDown(picture))
+    return float(np.abs(np.asarray(cv2.Laplacian(half, cv2.CV_16S, ksize=3))).mean())
+
+
+def _united(back: _Seen, kept: _Seen, known: I64, most: int) -> _Seen:
+    """Points that came back, and as many that were found since as there is room for."""
+    new = np.flatnonzero(~np.isin(kept.ids, known))[: max(0, most - len(back.ids))]
     ids = np.concatenate([back.ids, kept.ids[new]])
     order = np.argsort(ids)
     return _Seen(back.picture, ids[order], np.concatenate([back.points, kept.points[new]])[order])
