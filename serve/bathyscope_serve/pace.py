@@ -7,13 +7,12 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from bathyscope.vision.field_of_view import Mask
+from bathyscope.vision.field_of_view import BLACK, Mask
 from bathyscope.vision.motion import MotionMeter
 from bathyscope_serve.engine_settings import PaceSettings
 from bathyscope_serve.session import SmallFrame
 
-_BLACK = 8 / 255  # of a channel: what shows nothing but noise
-_FEW = 0.001
+_FEW = 0.001  # share of a picture
 
 
 def paced(
@@ -41,4 +40,4 @@ def paced(
 
 
 def _is_black(image: NDArray[np.float32], inside: Mask) -> bool:
-    return float((image[:, inside] > _BLACK).mean()) < _FEW
+    return float((image[:, inside] > BLACK / 255).mean()) < _FEW

@@ -21,6 +21,8 @@ Shape = Literal["full", "rectangle", "round", "hull"]
 
 DARK = 28
 """Largest value of a channel in what counts as black: borders of real videos stay below 20 with their noise."""
+BLACK = 8
+"""Largest value of a channel in what shows nothing but noise."""
 _SMALLEST_OUTSIDE = 0.004
 """Share of the frame below which a dark corner is taken for shadow."""
 _SMALLEST_INSIDE = 0.05

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bathyscope.camera import Size
+from bathyscope.vision.field_of_view import BLACK
 from bathyscope.vision.grid import Grid
 from bathyscope_serve.engine_settings import TrackSettings
 from bathyscope_serve.placed import Sight
@@ -29,7 +30,6 @@ _LEVELS = 4
 _ENOUGH = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 15, 0.02)
 _RETURN = 0.6  # pixels by which a point followed there and back may miss
 _BRIGHT = 200  # least channel of a highlight
-_BLACK = 8  # largest channel of what shows nothing but noise
 _SPACING = 9
 _QUALITY = 0.003
 _LEAST_PIXELS = 60_000  # smaller pictures are enlarged: windows must not hold half of the scene
@@ -41,10 +41,24 @@ _BLURRED = 0.7  # of the sharpness before: what is followed through such a frame
 
 
 @dataclass(frozen=True, slots=True)
+class _View:
+    """A frame as it is followed."""
+
+    picture: U8
+    usable: U8
+    """255 where there may be points."""
+    sharpness: float
+
+    def is_blurred(self, before: _View) -> bool:
+        """Whether much less can be seen in it than before."""
+        return self.sharpness < _BLURRED * before.sharpness
+
+
+@dataclass(frozen=True, slots=True)
 class _Seen:
     """Points in a picture."""
 
-    picture: U8
+    view: _View
     ids: I64
     points: F32
 
@@ -81,34 +95,33 @@ class PointTracker:
         """Where the points are in the next frame (H, W, 3), at source size; lost ones are replaced by others."""
         picture = self._cropped(image)
         now: U8 = np.asarray(self._even.apply(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)), np.uint8)
-        usable = self._usable(picture)
-        seen = self._kept(now, usable)
+        seen = self._kept(_View(now, self._usable(picture), _sharpness(now)))
         if len(seen.ids) < _FULL * self._most:
-            seen = self._refilled(seen, usable)
+            seen = self._refilled(seen)
         self._last = seen
         scale = np.array(self._grid.size[::-1]) / np.array(self._size[::-1])
         places = ((seen.points + 0.5) * scale).astype(np.float32)
         return Sight(seen.ids, places, float(np.sqrt(scale[0] * scale[1])))
 
-    def _kept(self, now: U8, usable: U8) -> _Seen:
+    def _kept(self, now: _View) -> _Seen:
         """The points that are still seen, or seen again."""
         if self._last is None:
             return _Seen(now, np.zeros(0, np.int64), np.zeros((0, 2), np.float32))
         last, behind = self._last, self._behind
-        kept = _followed(last, now, usable)
-        begins = _is_blurred(now, last.picture) and (behind is None or not _is_blurred(last.picture, behind.picture))
+        kept = _followed(last, now)
+        begins = now.is_blurred(last.view) and (behind is None or not last.view.is_blurred(behind.view))
         if behind is not None:
-            kept = self._brought_back(kept, behind, usable)
+            kept = self._brought_back(kept, behind)
         if begins or (behind is None and len(kept.ids) < _LOST * len(last.ids)):
             self._behind, self._patience = last, _PATIENCE
         return kept
 
-    def _brought_back(self, kept: _Seen, behind: _Seen, usable: U8) -> _Seen:
+    def _brought_back(self, kept: _Seen, behind: _Seen) -> _Seen:
         """With the points of an earlier frame, if more of them are found from there than through the frames between."""
-        back = _followed(behind, kept.picture, usable)
+        back = _followed(behind, kept.view)
         found = len(back.ids) > max(_LEAST, np.isin(kept.ids, behind.ids).sum())
         self._patience -= 1
-        if self._patience == 0 or (found and not _is_blurred(kept.picture, behind.picture)):
+        if self._patience == 0 or (found and not kept.view.is_blurred(behind.view)):
             self._behind = None
         return _united(back, kept, behind.ids, self._most) if found else kept
 
@@ -125,26 +138,21 @@ class PointTracker:
         red, green, blue = cv2.split(picture)
         _, bright = cv2.threshold(cv2.min(cv2.min(red, green), blue), _BRIGHT, 255, cv2.THRESH_BINARY)
         bright = cv2.dilate(bright, np.ones((9, 9), np.uint8))
-        lit = np.asarray(cv2.max(cv2.max(red, green), blue)) > _BLACK
+        lit = np.asarray(cv2.max(cv2.max(red, green), blue)) > BLACK
         return np.where((self._inside > 0) & (bright == 0) & lit, np.uint8(255), np.uint8(0))
 
-    def _refilled(self, seen: _Seen, usable: U8) -> _Seen:
-        free = usable.copy()
+    def _refilled(self, seen: _Seen) -> _Seen:
+        free = seen.view.usable.copy()
         for column, row in np.rint(seen.points).astype(int).tolist():
             cv2.circle(free, (column, row), _SPACING, 0, -1)
         wanted = self._most - len(seen.ids)
-        corners: Any = cv2.goodFeaturesToTrack(seen.picture, wanted, _QUALITY, _SPACING, mask=free)
+        corners: Any = cv2.goodFeaturesToTrack(seen.view.picture, wanted, _QUALITY, _SPACING, mask=free)
         if corners is None:
             return seen
         points = np.asarray(corners, np.float32).reshape(-1, 2)
         ids = np.arange(self._next, self._next + len(points))
         self._next += len(points)
-        return _Seen(seen.picture, np.concatenate([seen.ids, ids]), np.concatenate([seen.points, points]))
-
-
-def _is_blurred(picture: U8, before: U8) -> bool:
-    """Whether much less can be seen in it than before."""
-    return _sharpness(picture) < _BLURRED * _sharpness(before)
+        return _Seen(seen.view, np.concatenate([seen.ids, ids]), np.concatenate([seen.points, points]))
 
 
 def _sharpness(picture: U8) -> float:
@@ -158,20 +166,20 @@ def _united(back: _Seen, kept: _Seen, known: I64, most: int) -> _Seen:
     new = np.flatnonzero(~np.isin(kept.ids, known))[: max(0, most - len(back.ids))]
     ids = np.concatenate([back.ids, kept.ids[new]])
     order = np.argsort(ids)
-    return _Seen(back.picture, ids[order], np.concatenate([back.points, kept.points[new]])[order])
+    return _Seen(back.view, ids[order], np.concatenate([back.points, kept.points[new]])[order])
 
 
-def _followed(seen: _Seen, now: U8, usable: U8) -> _Seen:
-    """What is found of the points in another picture, where ``usable`` is not 0."""
+def _followed(seen: _Seen, now: _View) -> _Seen:
+    """What is found of the points in another picture."""
     if not len(seen.ids):
         return _Seen(now, seen.ids, seen.points)
-    there, found = _flow(seen.picture, now, seen.points)
-    back, returned = _flow(now, seen.picture, there)
-    height, width = now.shape
+    there, found = _flow(seen.view.picture, now.picture, seen.points)
+    back, returned = _flow(now.picture, seen.view.picture, there)
+    height, width = now.picture.shape
     nearest = np.rint(there).astype(int)
     inside = ((nearest >= 0) & (nearest < (width, height))).all(1)
     column, row = nearest[:, 0].clip(0, width - 1), nearest[:, 1].clip(0, height - 1)
-    kept = found & returned & inside & (usable[row, column] > 0)
+    kept = found & returned & inside & (now.usable[row, column] > 0)
     kept &= np.linalg.norm(back - seen.points, axis=1) < _RETURN
     return _Seen(now, seen.ids[kept], there[kept])
 
